@@ -1,0 +1,1 @@
+//! Everything graspd computes before the arm moves.

@@ -1,0 +1,2 @@
+//! The graspd program.
+fn main() {}

@@ -1,0 +1,1 @@
+//! graspd's contract with other processes.

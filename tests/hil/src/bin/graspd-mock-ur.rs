@@ -1,0 +1,2 @@
+//! A mock UR controller.
+fn main() {}

@@ -1,0 +1,2 @@
+//! A stereo scene simulator.
+fn main() {}
