@@ -1,1 +1,4 @@
 //! Everything graspd computes before the arm moves.
+#![forbid(unsafe_code)]
+
+pub mod offline;

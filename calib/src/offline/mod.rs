@@ -1,0 +1,4 @@
+//! The off-line stage, one file per step of the paper: from edge points in two views to a rim in space and a grasp on it.
+
+pub mod model;
+pub mod refusal;

@@ -1,0 +1,155 @@
+//! Why a reconstruction is refused, and what the operator can do about it.
+
+use graspd_rt::geom::View;
+
+/// Name of a view in a sentence.
+pub(crate) fn name(view: &View) -> &'static str {
+    match view {
+        View::Left => "left",
+        View::Right => "right",
+    }
+}
+
+/// Why no rim is returned. The text says what was found and what to change.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Refusal {
+    /// A coordinate, sigma or matrix entry is not a finite number, or a sigma is not positive.
+    #[error("{what} is not usable: {why}")]
+    BadInput {
+        /// Which input.
+        what: &'static str,
+        /// What is wrong with it.
+        why: &'static str,
+    },
+    /// Fewer than five edge points.
+    #[error("{} view: {count} edge points, at least {needed} are needed: click a longer piece of the contour", name(.view))]
+    TooFewPoints {
+        /// The view.
+        view: View,
+        /// How many there are.
+        count: usize,
+        /// How many are needed.
+        needed: usize,
+    },
+    /// The points lie on a line: a straight edge, or the rim's plane contains the projection centre.
+    #[error("{} view: the points are collinear; either a straight edge was clicked, or the rim is seen edge-on: click the rim, or move the rig so that it sees the rim's face", name(.view))]
+    Collinear {
+        /// The view.
+        view: View,
+    },
+    /// The best conic is a hyperbola, a parabola or a line pair.
+    #[error("{} view: the points do not lie on an ellipse: click one closed round contour", name(.view))]
+    NotAnEllipse {
+        /// The view.
+        view: View,
+    },
+    /// Too little of the ellipse is seen to determine it.
+    #[error("{} view: the arc is too short: its semi-axis is known to {percent:.0} % only: click more of the rim, or move the rig to see more of it", name(.view))]
+    ArcTooShort {
+        /// The view.
+        view: View,
+        /// Standard deviation of an axis in percent.
+        percent: f64,
+    },
+    /// The residuals are too large for edge points of one ellipse.
+    #[error("{} view: the points scatter by {sigma_px:.2} px about the best ellipse (limit {limit_px:.2}): they belong to more than one contour, click again", name(.view))]
+    Scattered {
+        /// The view.
+        view: View,
+        /// Standard deviation of the residuals, pixels.
+        sigma_px: f64,
+        /// The limit, pixels.
+        limit_px: f64,
+    },
+    /// The rim is seen edge-on.
+    #[error("{} view: the rim is seen edge-on, its picture has a semi-minor axis of {minor_px:.1} px (limit {limit_px:.1}): move the rig to see more of its face", name(.view))]
+    EdgeOn {
+        /// The view.
+        view: View,
+        /// Semi-minor axis, pixels.
+        minor_px: f64,
+        /// The limit, pixels.
+        limit_px: f64,
+    },
+    /// A projection matrix is not a finite camera.
+    #[error("{} projection matrix is not a finite camera: its left 3x3 block is singular", name(.view))]
+    Camera {
+        /// The view.
+        view: View,
+    },
+    /// Both cameras stand at one place.
+    #[error("the cameras have no baseline: both projection centres coincide; check the rig file")]
+    NoBaseline,
+    /// The two contours are not pictures of one rim.
+    #[error("the two contours are not pictures of one rim: epipolar tangents differ by {:.2} and {:.2} px, {:.1} and {:.1} standard deviations; two-view excess {excess:.1} (limit {limit:.1}), delta {delta:.1e}: click the same contour in both pictures",
+        gap_px[0], gap_px[1], gap_px[0].abs() / gap_sigma_px[0], gap_px[1].abs() / gap_sigma_px[1])]
+    Mismatch {
+        /// Epipolar tangency gaps, pixels.
+        gap_px: [f64; 2],
+        /// Their predicted standard deviations, pixels.
+        gap_sigma_px: [f64; 2],
+        /// Excess chi-squared of the two-view fit.
+        excess: f64,
+        /// What it may be.
+        limit: f64,
+        /// The paper's condition, scale-free.
+        delta: f64,
+    },
+    /// The pencil of the cones has no real pair of planes.
+    #[error(
+        "the two viewing cones have no real pair of planes in common ({why}): click the same contour in both pictures, or move the rig off the rim's axis"
+    )]
+    NoPlanes {
+        /// Which step failed.
+        why: &'static str,
+    },
+    /// Neither plane has both cameras on one side with an ellipse in it.
+    #[error(
+        "no plane is seen from one side by both cameras ({why}): the cameras look at opposite faces, or different contours were clicked: move the rig so that both see the same face"
+    )]
+    OppositeSides {
+        /// Which test failed.
+        why: &'static str,
+    },
+    /// The rim would lie behind a camera.
+    #[error("the rim would lie behind the {} camera: views swapped, or different contours were clicked", name(.view))]
+    Behind {
+        /// The view.
+        view: View,
+    },
+    /// The maximum-likelihood fit did not converge to a proper rim.
+    #[error("the two-view fit did not converge ({why}): click more of the rim")]
+    NoFit {
+        /// What went wrong.
+        why: &'static str,
+    },
+    /// A round bar cannot be told from its outer outline alone.
+    #[error(
+        "the outer outline alone does not determine a round bar (centre {sigma_centre:.3}, normal {sigma_normal_deg:.2} degrees): click the inner outline as well, or give the bar's diameter"
+    )]
+    BarUndetermined {
+        /// Predicted standard deviation of the centre, length units.
+        sigma_centre: f64,
+        /// Predicted standard deviation of the normal, degrees.
+        sigma_normal_deg: f64,
+    },
+    /// The result is less certain than asked for.
+    #[error(
+        "too uncertain: centre {sigma_centre:.4} (limit {limit_centre:.4}), normal {sigma_normal_deg:.2} degrees (limit {limit_normal_deg:.2}), vergence {vergence_deg:.1} degrees: {advice}"
+    )]
+    TooUncertain {
+        /// Predicted standard deviation of the centre, length units.
+        sigma_centre: f64,
+        /// Its limit.
+        limit_centre: f64,
+        /// Predicted standard deviation of the normal, degrees.
+        sigma_normal_deg: f64,
+        /// Its limit.
+        limit_normal_deg: f64,
+        /// Angle between the viewing rays, degrees.
+        vergence_deg: f64,
+        /// What to change.
+        advice: &'static str,
+    },
+}
