@@ -1,4 +1,5 @@
 //! Everything graspd computes before the arm moves.
 #![forbid(unsafe_code)]
 
+pub mod files;
 pub mod offline;
