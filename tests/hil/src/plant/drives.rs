@@ -1,0 +1,129 @@
+//! The mechanical half: six joints that follow their targets with lag, limited acceleration and quantised encoders.
+
+use super::Joints;
+
+/// A disturbance of the joints, on command.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct DriveFault {
+    /// Extra time constant of the velocity loop, s: the arm trails its target.
+    pub lag_s: f64,
+    /// Joint rates added to whatever the loop asks, rad/s: the arm creeps without a command.
+    pub drift: Joints,
+    /// Joints that do not move at all.
+    pub stuck: [bool; 6],
+}
+
+/// Six joints with their own position and speed.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Drives {
+    q: Joints,
+    qd: Joints,
+    /// Accelerations of the last step, rad/s^2.
+    qdd: Joints,
+    max_accel: f64,
+    fault: DriveFault,
+    braked: bool,
+}
+
+/// Time constant of the velocity loop, s.
+const VELOCITY_LAG_S: f64 = 0.004;
+/// Position loop gain, 1/s: a quarter of the velocity loop's corner, which damps it critically.
+const POSITION_GAIN: f64 = 62.5;
+/// Encoder counts a turn of the joint: 2^20.
+const COUNTS_PER_RAD: f64 = 1_048_576.0 / std::f64::consts::TAU;
+
+impl Drives {
+    /// At rest at `q`.
+    pub fn new(q: Joints, max_accel: f64) -> Self {
+        Drives { q, qd: [0.0; 6], qdd: [0.0; 6], max_accel, fault: DriveFault::default(), braked: false }
+    }
+
+    /// Puts a disturbance on the joints; the default takes it away.
+    pub fn set_fault(&mut self, fault: DriveFault) {
+        self.fault = fault;
+    }
+
+    /// The disturbance now acting.
+    pub fn fault(&self) -> &DriveFault {
+        &self.fault
+    }
+
+    /// Sets or frees the brakes. A brake holds the joint where it is; a moving joint is stopped at the acceleration limit.
+    pub fn set_brakes(&mut self, on: bool) {
+        self.braked = on;
+    }
+
+    /// One step towards the targets.
+    pub fn step(&mut self, target_q: &Joints, target_qd: &Joints, dt: f64) {
+        let blend = 1.0 - (-dt / (VELOCITY_LAG_S + self.fault.lag_s)).exp();
+        let most = self.max_accel * dt;
+        for i in 0..6 {
+            let wanted = if self.braked {
+                0.0
+            } else {
+                target_qd[i] + POSITION_GAIN / (1.0 + self.fault.lag_s / VELOCITY_LAG_S) * (target_q[i] - self.q[i])
+            };
+            let before = self.qd[i];
+            let change = if self.braked { -before } else { blend * (wanted - before) };
+            self.qd[i] = before + change.clamp(-most, most);
+            if self.fault.stuck[i] {
+                self.qd[i] = 0.0;
+            }
+            self.qdd[i] = (self.qd[i] - before) / dt;
+            self.q[i] += (self.qd[i] + self.fault.drift[i]) * dt;
+        }
+    }
+
+    /// Joint positions as the encoders read them, rad.
+    pub fn read_q(&self) -> Joints {
+        self.q.map(|q| (q * COUNTS_PER_RAD).round() / COUNTS_PER_RAD)
+    }
+
+    /// Joint speeds, rad/s.
+    pub fn read_qd(&self) -> Joints {
+        std::array::from_fn(|i| self.qd[i] + self.fault.drift[i])
+    }
+
+    /// Joint accelerations of the last step, rad/s^2.
+    pub fn accelerations(&self) -> Joints {
+        self.qdd
+    }
+
+    /// Exact joint positions, rad.
+    pub fn true_q(&self) -> Joints {
+        self.q
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn follows_a_ramp_with_little_lag_and_bounded_acceleration() {
+        let mut d = Drives::new([0.0; 6], 40.0);
+        let (mut q, dt) = (0.0, 0.002);
+        for k in 0..500 {
+            let v = (k as f64 * dt * 2.0).min(0.5);
+            q += v * dt;
+            d.step(&[q; 6], &[v; 6], dt);
+            assert!(d.accelerations().iter().all(|a| a.abs() <= 40.0 + 1e-9));
+        }
+        assert!((d.read_qd()[0] - 0.5).abs() < 1e-3);
+        assert!((d.read_q()[0] - q).abs() < 2e-3, "{}", d.read_q()[0] - q);
+    }
+
+    #[test]
+    fn brakes_hold_and_a_stuck_joint_stays() {
+        let mut d = Drives::new([0.1; 6], 40.0);
+        d.set_brakes(true);
+        d.step(&[1.0; 6], &[1.0; 6], 0.002);
+        assert!((d.true_q()[0] - 0.1).abs() < 1e-12);
+        d.set_brakes(false);
+        d.set_fault(DriveFault { stuck: [true, false, false, false, false, false], ..DriveFault::default() });
+        for _ in 0..200 {
+            d.step(&[0.2; 6], &[0.0; 6], 0.002);
+        }
+        assert!((d.true_q()[0] - 0.1).abs() < 1e-12 && (d.true_q()[1] - 0.2).abs() < 1e-3);
+    }
+}

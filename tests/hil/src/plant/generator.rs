@@ -1,0 +1,554 @@
+//! The controller half of motion: commands in, target joint positions out, one step at a time.
+
+use super::path::CartesianPath;
+use super::profile::Profile;
+use super::{Joints, Kinematics, vector_to_pose};
+use nalgebra::{Isometry3, Vector3, Vector6};
+
+/// A motion command, as the URScript call of the same name gives it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Motion {
+    /// `speedj`: reach and KEEP these joint rates (rad/s) until another motion; the leading axis accelerates at `accel`.
+    SpeedJ {
+        /// Joint rates, rad/s.
+        qd: Joints,
+        /// Acceleration of the leading axis, rad/s^2.
+        accel: f64,
+    },
+    /// `speedl`: reach and keep this tool velocity (linear then angular, base).
+    SpeedL {
+        /// m/s and rad/s.
+        twist: [f64; 6],
+        /// Linear acceleration, m/s^2.
+        accel: f64,
+        /// Angular acceleration, rad/s^2.
+        rot_accel: f64,
+    },
+    /// `servoj`: follow a joint position with about `lookahead` seconds of delay.
+    Servo {
+        /// Joint positions, rad.
+        q: Joints,
+        /// Smoothing time, s.
+        lookahead: f64,
+        /// Proportional gain; 300 is the default.
+        gain: f64,
+    },
+    /// `movej`: to joint positions, straight in joint space.
+    MoveJ {
+        /// Joint positions, rad.
+        q: Joints,
+        /// rad/s^2.
+        accel: f64,
+        /// rad/s.
+        speed: f64,
+        /// s; 0 leaves `speed` in charge.
+        duration: f64,
+    },
+    /// `movel` and `movep`: the tool to a pose (x, y, z, rotation vector), straight in space.
+    MoveL {
+        /// Tool pose in base.
+        pose: [f64; 6],
+        /// m/s^2.
+        accel: f64,
+        /// m/s.
+        speed: f64,
+        /// s; 0 leaves `speed` in charge.
+        duration: f64,
+    },
+    /// `movec`: the tool along the circle through `via`.
+    MoveC {
+        /// A pose on the way; only its position counts.
+        via: [f64; 6],
+        /// Tool pose at the end, base.
+        pose: [f64; 6],
+        /// m/s^2.
+        accel: f64,
+        /// m/s.
+        speed: f64,
+    },
+    /// `stopj`: joints to rest.
+    StopJ {
+        /// rad/s^2.
+        decel: f64,
+    },
+    /// `stopl`: tool to rest along its direction.
+    StopL {
+        /// m/s^2.
+        decel: f64,
+        /// rad/s^2.
+        rot_decel: f64,
+    },
+}
+
+/// Why the controller itself stops the arm.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum StopCause {
+    /// A joint was asked to turn faster than it may.
+    #[error("joint {joint} asked to turn at {speed:.3} rad/s, limit {limit:.3}")]
+    JointSpeed {
+        /// 0 is the base.
+        joint: usize,
+        /// rad/s.
+        speed: f64,
+        /// rad/s.
+        limit: f64,
+    },
+    /// A joint is about to run into its end stop.
+    #[error("joint {joint} at {position:.4} rad is close to its limit")]
+    JointPosition {
+        /// 0 is the base.
+        joint: usize,
+        /// rad.
+        position: f64,
+    },
+    /// A joint does not follow its target.
+    #[error("position of joint {joint} deviates from path by {deviation:.4} rad")]
+    PathDeviation {
+        /// 0 is the base.
+        joint: usize,
+        /// rad.
+        deviation: f64,
+    },
+    /// A tool path leaves the reach of the arm.
+    #[error("no inverse kinematics on the way to the target pose")]
+    Unreachable,
+}
+
+/// What is going on now.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Active {
+    Rest,
+    Follow(Motion),
+    /// To rest at the given rate, then perhaps a move.
+    Brake(f64, Option<Motion>),
+    Joint {
+        from: Joints,
+        to: Joints,
+        profile: Profile,
+    },
+    Tool {
+        path: CartesianPath,
+        profile: Profile,
+    },
+}
+
+/// Largest acceleration of a target, rad/s^2: what Universal Robots' own control script asks for at most.
+pub(crate) const MAX_TARGET_ACCEL: f64 = 40.0;
+/// Deceleration of a stop by the safety system, rad/s^2.
+pub(crate) const SAFETY_DECEL: f64 = 20.0;
+/// How fast the speed scaling may change, 1/s.
+const SCALING_SLEW: f64 = 5.0;
+/// Largest linear deceleration of `StopL` and friends, m/s^2.
+const MAX_TOOL_ACCEL: f64 = 150.0;
+/// Share of the joint speed limits that reduced mode leaves.
+const REDUCED_SHARE: f64 = 0.5;
+
+/// The motion generator: targets of six joints.
+#[derive(Clone, Debug)]
+pub struct Generator {
+    q: Joints,
+    qd: Joints,
+    qdd: Joints,
+    active: Active,
+    scaling: f64,
+    max_speed: Joints,
+    position_limit: Joints,
+    reduced: bool,
+    kinematics: Kinematics,
+    tool: Isometry3<f64>,
+}
+
+impl Generator {
+    /// At rest at `q`.
+    pub fn new(q: Joints, kinematics: Kinematics, max_speed: Joints, position_limit: Joints) -> Self {
+        Generator {
+            q,
+            qd: [0.0; 6],
+            qdd: [0.0; 6],
+            active: Active::Rest,
+            scaling: 1.0,
+            max_speed,
+            position_limit,
+            reduced: false,
+            kinematics,
+            tool: Isometry3::identity(),
+        }
+    }
+
+    /// Target positions, rad.
+    pub fn q(&self) -> &Joints {
+        &self.q
+    }
+
+    /// Target speeds, rad/s.
+    pub fn qd(&self) -> &Joints {
+        &self.qd
+    }
+
+    /// Target accelerations of the last step, rad/s^2.
+    pub fn qdd(&self) -> &Joints {
+        &self.qdd
+    }
+
+    /// Speed scaling now in force, 0 to 1.
+    pub fn scaling(&self) -> f64 {
+        self.scaling
+    }
+
+    /// `flange_from_tcp` used by tool motions.
+    pub fn set_tool(&mut self, flange_from_tcp: Isometry3<f64>) {
+        self.tool = flange_from_tcp;
+    }
+
+    /// Halves the joint speed limits (a set-point beyond them is scaled down), or restores them.
+    pub fn set_reduced(&mut self, reduced: bool) {
+        self.reduced = reduced;
+    }
+
+    /// Starts a motion in place of the one before. A move begins after the arm came to rest.
+    pub fn start(&mut self, motion: Motion) {
+        self.active = match motion {
+            Motion::SpeedJ { .. } | Motion::SpeedL { .. } | Motion::Servo { .. } | Motion::StopL { .. } => {
+                Active::Follow(motion)
+            }
+            Motion::StopJ { decel } => Active::Brake(decel, None),
+            Motion::MoveJ { accel, .. } => Active::Brake(accel, Some(motion)),
+            Motion::MoveL { .. } | Motion::MoveC { .. } => Active::Brake(4.0, Some(motion)),
+        };
+    }
+
+    /// Brings the joints to rest as the safety system does.
+    pub fn safety_stop(&mut self) {
+        self.active = Active::Brake(SAFETY_DECEL, None);
+    }
+
+    /// Puts the targets on the joints, at rest: after power came back or brakes opened.
+    pub fn snap(&mut self, q: Joints) {
+        (self.q, self.qd, self.qdd, self.active) = (q, [0.0; 6], [0.0; 6], Active::Rest);
+    }
+
+    /// Whether the motion has reached what it wanted: the end, rest, or the speed asked for.
+    pub fn is_settled(&self) -> bool {
+        match &self.active {
+            Active::Rest => true,
+            Active::Brake(..) => false,
+            Active::Joint { profile, .. } | Active::Tool { profile, .. } => profile.is_done(),
+            Active::Follow(Motion::SpeedJ { qd, .. }) => {
+                (0..6).all(|i| (self.qd[i] - qd[i] * self.scaling).abs() < 1e-9)
+            }
+            Active::Follow(Motion::SpeedL { twist, .. }) => {
+                let now = self.tool_velocity();
+                (0..6).all(|i| (now[i] - twist[i] * self.scaling).abs() < 1e-4)
+            }
+            Active::Follow(Motion::StopL { .. }) => self.at_rest(),
+            Active::Follow(Motion::Servo { q, .. }) => {
+                self.at_rest() && (0..6).all(|i| (self.q[i] - q[i]).abs() < 1e-4)
+            }
+            Active::Follow(_) => true,
+        }
+    }
+
+    /// Whether all targets stand still.
+    pub fn at_rest(&self) -> bool {
+        self.qd.iter().all(|v| v.abs() < 1e-6)
+    }
+
+    /// Fraction of the move that is done, 0 to 1; 1 when no move is under way.
+    pub fn progress(&self) -> f64 {
+        match &self.active {
+            Active::Joint { profile, .. } | Active::Tool { profile, .. } => profile.fraction(),
+            Active::Brake(_, Some(_)) => 0.0,
+            _ => 1.0,
+        }
+    }
+
+    /// Velocity of the tool by the targets: linear then angular, base.
+    pub fn tool_velocity(&self) -> [f64; 6] {
+        (self.kinematics.jacobian(&self.q, &self.tool) * Vector6::from_column_slice(&self.qd)).into()
+    }
+
+    /// One control step. `wanted_scaling` (0 to 1) slows everything but a stop. Bounded work: at most one inverse kinematics.
+    pub fn step(&mut self, dt: f64, wanted_scaling: f64) -> Result<(), StopCause> {
+        let slew = SCALING_SLEW * dt;
+        self.scaling += (wanted_scaling.clamp(0.0, 1.0) - self.scaling).clamp(-slew, slew);
+        let (q, qd) = (self.q, self.qd);
+        let result = self.advance(dt);
+        if result.is_err() {
+            (self.q, self.qd) = (q, qd);
+            self.safety_stop();
+            self.brake(SAFETY_DECEL, dt);
+        }
+        self.qdd = std::array::from_fn(|i| (self.qd[i] - qd[i]) / dt);
+        result.and_then(|()| self.check(dt))
+    }
+
+    fn advance(&mut self, dt: f64) -> Result<(), StopCause> {
+        match self.active {
+            Active::Rest => self.qd = [0.0; 6],
+            Active::Brake(decel, next) => {
+                if self.brake(decel, dt) {
+                    self.active = match next {
+                        Some(motion) => self.plan(motion),
+                        None => Active::Rest,
+                    };
+                }
+            }
+            Active::Follow(motion) => self.follow(motion, dt)?,
+            Active::Joint { from, to, mut profile } => {
+                let was = profile.fraction();
+                profile.advance(dt * self.path_scaling());
+                let now = profile.fraction();
+                self.active = if profile.is_done() { Active::Rest } else { Active::Joint { from, to, profile } };
+                self.q = std::array::from_fn(|i| from[i] + (to[i] - from[i]) * now);
+                self.qd = std::array::from_fn(|i| (to[i] - from[i]) * (now - was) / dt);
+            }
+            Active::Tool { path, mut profile } => {
+                profile.advance(dt * self.path_scaling());
+                let goal = path.at(profile.fraction()) * self.tool.inverse();
+                let q = self.kinematics.inverse(&goal, &self.q).ok_or(StopCause::Unreachable)?;
+                self.qd = std::array::from_fn(|i| (q[i] - self.q[i]) / dt);
+                self.q = q;
+                self.active = if profile.is_done() { Active::Rest } else { Active::Tool { path, profile } };
+            }
+        }
+        Ok(())
+    }
+
+    fn path_scaling(&self) -> f64 {
+        self.scaling * if self.reduced { REDUCED_SHARE } else { 1.0 }
+    }
+
+    /// Turns a waiting move into a path from where the arm now rests.
+    fn plan(&self, motion: Motion) -> Active {
+        match motion {
+            Motion::MoveJ { q, accel, speed, duration } => {
+                let far = (0..6).map(|i| (q[i] - self.q[i]).abs()).fold(0.0, f64::max);
+                // A joint slower than the leading one's speed may still be beyond its own limit: the whole move slows down.
+                let allowed = (0..6)
+                    .map(|i| self.max_speed[i] * far / (q[i] - self.q[i]).abs().max(1e-12))
+                    .fold(speed.abs(), f64::min);
+                let accel = accel.abs().min(MAX_TARGET_ACCEL);
+                Active::Joint { from: self.q, to: q, profile: Profile::new(far, allowed, accel, duration) }
+            }
+            Motion::MoveL { pose, accel, speed, duration } => {
+                let path = CartesianPath::Line { from: self.tool_pose(), to: vector_to_pose(&pose) };
+                Active::Tool { path, profile: Profile::new(path.length(), speed, accel, duration) }
+            }
+            Motion::MoveC { via, pose, accel, speed } => {
+                let via = Vector3::new(via[0], via[1], via[2]);
+                let path = CartesianPath::arc(self.tool_pose(), via, vector_to_pose(&pose));
+                Active::Tool { path, profile: Profile::new(path.length(), speed, accel, 0.0) }
+            }
+            _ => Active::Rest,
+        }
+    }
+
+    /// Tool pose by the targets.
+    pub fn tool_pose(&self) -> Isometry3<f64> {
+        self.kinematics.forward(&self.q) * self.tool
+    }
+
+    /// Slows the joints, the leading one at `decel`; true at rest.
+    fn brake(&mut self, decel: f64, dt: f64) -> bool {
+        let goal = [0.0; 6];
+        self.approach(&goal, decel, dt);
+        self.qd.iter().all(|v| *v == 0.0)
+    }
+
+    /// Moves the joint speeds straight towards `goal`, the leading axis at `accel`, and integrates.
+    fn approach(&mut self, goal: &Joints, accel: f64, dt: f64) {
+        let most = accel.abs().clamp(1e-3, MAX_TARGET_ACCEL) * dt;
+        let delta: Joints = std::array::from_fn(|i| goal[i] - self.qd[i]);
+        let lead = delta.iter().fold(0.0f64, |m, d| m.max(d.abs()));
+        if lead <= most {
+            self.qd = *goal;
+        } else {
+            let share = most / lead;
+            self.qd = std::array::from_fn(|i| self.qd[i] + delta[i] * share);
+        }
+        for i in 0..6 {
+            self.q[i] += self.qd[i] * dt;
+        }
+    }
+
+    fn follow(&mut self, motion: Motion, dt: f64) -> Result<(), StopCause> {
+        match motion {
+            Motion::SpeedJ { qd, accel } => {
+                let goal = self.reduce(qd.map(|v| v * self.scaling));
+                self.approach(&goal, accel, dt);
+            }
+            Motion::SpeedL { twist, accel, rot_accel } => self.tool_follow(&twist, accel, rot_accel, dt),
+            Motion::StopL { decel, rot_decel } => {
+                self.tool_follow(&[0.0; 6], decel, rot_decel, dt);
+                if self.tool_velocity().iter().all(|v| v.abs() < 1e-4) && self.brake(SAFETY_DECEL, dt) {
+                    self.active = Active::Rest;
+                }
+            }
+            Motion::Servo { q, lookahead, gain } => {
+                let settle = (lookahead.clamp(0.03, 0.2) * (300.0 / gain.clamp(100.0, 2000.0)).sqrt()).max(2.0 * dt);
+                // As fast as the lookahead asks, but never faster than the arm can still brake.
+                let goal = std::array::from_fn(|i| {
+                    let e = q[i] - self.q[i];
+                    let can_brake = (2.0 * 0.8 * MAX_TARGET_ACCEL * e.abs()).sqrt();
+                    let v = (e / settle).clamp(-can_brake, can_brake);
+                    v.clamp(-self.max_speed[i], self.max_speed[i]) * self.scaling
+                });
+                let goal = self.reduce(goal);
+                for i in 0..6 {
+                    let most = MAX_TARGET_ACCEL * dt;
+                    self.qd[i] += (goal[i] - self.qd[i]).clamp(-most, most);
+                    self.q[i] += self.qd[i] * dt;
+                }
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn tool_follow(&mut self, twist: &[f64; 6], accel: f64, rot_accel: f64, dt: f64) {
+        let now = Vector6::from(self.tool_velocity());
+        let mut next = now;
+        for (rows, rate) in [(0, accel.abs().min(MAX_TOOL_ACCEL)), (3, rot_accel.abs().min(MAX_TOOL_ACCEL))] {
+            let goal = Vector3::new(twist[rows], twist[rows + 1], twist[rows + 2]) * self.scaling;
+            let have = now.fixed_rows::<3>(rows).into_owned();
+            let delta = goal - have;
+            let most = rate.max(1e-3) * dt;
+            let share = if delta.norm() <= most { 1.0 } else { most / delta.norm() };
+            next.fixed_rows_mut::<3>(rows).copy_from(&(have + delta * share));
+        }
+        let goal = self.reduce(self.kinematics.joint_rates(&self.q, &self.tool, &next.into()));
+        self.approach(&goal, MAX_TARGET_ACCEL, dt);
+    }
+
+    /// Scales joint rates into the reduced limits, keeping their direction.
+    fn reduce(&self, qd: Joints) -> Joints {
+        if !self.reduced {
+            return qd;
+        }
+        let over = (0..6).map(|i| qd[i].abs() / (self.max_speed[i] * REDUCED_SHARE)).fold(1.0, f64::max);
+        qd.map(|v| v / over)
+    }
+
+    /// Speed limits, and position limits with room left to brake.
+    fn check(&mut self, dt: f64) -> Result<(), StopCause> {
+        for i in 0..6 {
+            let (q, qd, limit) = (self.q[i], self.qd[i], self.max_speed[i]);
+            let braking = qd * qd / (2.0 * SAFETY_DECEL) + 2.0 * qd.abs() * dt + 1e-3;
+            let cause = if qd.abs() > limit * 1.0001 {
+                StopCause::JointSpeed { joint: i, speed: qd, limit }
+            } else if q * qd > 0.0 && q.abs() + braking > self.position_limit[i] && qd.abs() > 1e-6 {
+                StopCause::JointPosition { joint: i, position: q }
+            } else {
+                continue;
+            };
+            if matches!(self.active, Active::Brake(_, None)) {
+                continue; // already stopping
+            }
+            self.safety_stop();
+            return Err(cause);
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Model;
+    use super::*;
+
+    const START: Joints = [0.3, -1.2, 1.4, -0.9, 1.1, 0.5];
+
+    fn generator() -> Generator {
+        let m = Model::by_name("ur5e").unwrap();
+        Generator::new(START, m.nominal(), m.max_speed, m.position_limit())
+    }
+
+    fn run(g: &mut Generator, seconds: f64) -> Result<(), StopCause> {
+        for _ in 0..(seconds / 0.002) as usize {
+            g.step(0.002, 1.0)?;
+        }
+        Ok(())
+    }
+
+    #[test]
+    fn speedj_keeps_moving_until_told_otherwise() {
+        let mut g = generator();
+        g.start(Motion::SpeedJ { qd: [0.2, 0.0, -0.1, 0.0, 0.0, 0.0], accel: 2.0 });
+        run(&mut g, 2.0).unwrap();
+        assert!((g.qd()[0] - 0.2).abs() < 1e-12 && (g.qd()[2] + 0.1).abs() < 1e-12);
+        assert!((g.q()[0] - START[0] - 0.2 * 1.95).abs() < 1e-3);
+        g.start(Motion::StopJ { decel: 4.0 });
+        run(&mut g, 0.052).unwrap();
+        assert!(g.at_rest() && g.is_settled());
+    }
+
+    #[test]
+    fn movej_and_movel_arrive_where_they_were_sent() {
+        let mut g = generator();
+        let to = [0.5, -1.0, 1.2, -1.0, 1.3, 0.0];
+        g.start(Motion::MoveJ { q: to, accel: 1.4, speed: 1.05, duration: 0.0 });
+        run(&mut g, 2.0).unwrap();
+        assert!(g.is_settled() && (0..6).all(|i| (g.q()[i] - to[i]).abs() < 1e-12));
+        g.set_tool(Isometry3::translation(0.0, 0.0, 0.1));
+        let mut goal = super::super::pose_to_vector(&g.tool_pose());
+        goal[2] -= 0.1;
+        g.start(Motion::MoveL { pose: goal, accel: 1.2, speed: 0.25, duration: 0.0 });
+        run(&mut g, 2.0).unwrap();
+        let there = super::super::pose_to_vector(&g.tool_pose());
+        assert!(g.is_settled() && (0..6).all(|i| (there[i] - goal[i]).abs() < 1e-7), "{there:?} {goal:?}");
+    }
+
+    #[test]
+    fn servoj_lags_by_about_its_lookahead() {
+        let mut g = generator();
+        let mut goal = START;
+        for _ in 0..1000 {
+            goal[0] += 0.3 * 0.002;
+            g.start(Motion::Servo { q: goal, lookahead: 0.1, gain: 300.0 });
+            g.step(0.002, 1.0).unwrap();
+        }
+        let lag = (goal[0] - g.q()[0]) / 0.3;
+        assert!((lag - 0.1).abs() < 0.01, "{lag}");
+    }
+
+    #[test]
+    fn speedl_moves_the_tool_straight() {
+        let mut g = generator();
+        let from = g.tool_pose().translation.vector;
+        g.start(Motion::SpeedL { twist: [0.0, 0.0, -0.1, 0.0, 0.0, 0.0], accel: 0.5, rot_accel: 1.0 });
+        run(&mut g, 1.0).unwrap();
+        let moved = g.tool_pose().translation.vector - from;
+        assert!(moved.x.abs() < 2e-4 && moved.y.abs() < 2e-4 && (moved.z + 0.09).abs() < 2e-3, "{moved}");
+        g.start(Motion::StopL { decel: 0.5, rot_decel: 1.0 });
+        run(&mut g, 0.3).unwrap();
+        assert!(g.at_rest());
+    }
+
+    #[test]
+    fn runs_into_no_end_stop_and_no_speed_limit() {
+        let mut g = generator();
+        g.start(Motion::SpeedJ { qd: [2.0, 0.0, 0.0, 0.0, 0.0, 0.0], accel: 10.0 });
+        assert!(matches!(run(&mut g, 4.0), Err(StopCause::JointPosition { joint: 0, .. })));
+        run(&mut g, 1.0).unwrap();
+        assert!(g.at_rest() && g.q()[0] < std::f64::consts::TAU);
+        let mut g = generator();
+        g.start(Motion::SpeedJ { qd: [4.0, 0.0, 0.0, 0.0, 0.0, 0.0], accel: 40.0 });
+        assert!(matches!(run(&mut g, 1.0), Err(StopCause::JointSpeed { joint: 0, .. })));
+    }
+
+    #[test]
+    fn the_slider_slows_and_reduced_mode_caps() {
+        let mut g = generator();
+        g.start(Motion::SpeedJ { qd: [1.0; 6], accel: 10.0 });
+        for _ in 0..500 {
+            g.step(0.002, 0.25).unwrap();
+        }
+        assert!((g.qd()[3] - 0.25).abs() < 1e-9);
+        let mut g = generator();
+        g.set_reduced(true);
+        g.start(Motion::SpeedJ { qd: [3.0, 1.5, 0.0, 0.0, 0.0, 0.0], accel: 10.0 });
+        run(&mut g, 0.5).unwrap();
+        let half = Model::by_name("ur5e").unwrap().max_speed[0] / 2.0;
+        assert!((g.qd()[0] - half).abs() < 1e-9 && (g.qd()[1] - half / 2.0).abs() < 1e-9);
+    }
+}

@@ -1,0 +1,24 @@
+//! The arm that the mock controller moves: kinematics, motion generators, joint dynamics.
+//!
+//! The controller half (`Generator`) turns motion commands into target positions once a step, as a real controller does; the
+//! mechanical half (`Drives`) follows those targets with lag, limited acceleration and quantised encoders. Nothing here reads a
+//! clock or a socket: `dt` is an argument.
+
+mod drives;
+mod generator;
+mod gravity;
+mod kinematics;
+mod model;
+mod path;
+mod profile;
+
+pub use drives::{DriveFault, Drives};
+pub use generator::{Generator, Motion, StopCause};
+pub use gravity::gravity_torques;
+pub use kinematics::{DhRow, Kinematics, KinematicsFileError, pose_to_vector, vector_to_pose};
+pub use model::{Generation, Model, UnknownModel};
+pub use path::CartesianPath;
+pub use profile::Profile;
+
+/// Joint values, base to wrist 3.
+pub type Joints = [f64; 6];
