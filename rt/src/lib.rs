@@ -9,6 +9,7 @@
 pub mod arm;
 pub mod geom;
 pub mod gripper;
+pub mod guard;
 pub mod image;
 pub mod math;
 pub mod online;

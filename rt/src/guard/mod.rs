@@ -1,0 +1,253 @@
+//! The only way out: every rate that reaches the wire has passed through [`Guard::step`].
+//!
+//! It trusts nothing that computed the rates. Whatever comes in, numbers that are none included, what goes out is finite, within
+//! joint speed, joint acceleration and gripper speed, and leaves the arm able to stop before every joint's end. Limits are kept
+//! by slowing the whole motion, never by clipping single joints, so that its direction stays.
+//!
+//! How it knows that it can always stop: the *stop ramp* shrinks all rates together to zero at the acceleration limit. A step
+//! towards the wanted rates is taken only if the stop ramp from there still ends inside the joints' ranges; otherwise the
+//! step taken is the stop ramp's own. A ramp that was possible at the last step is possible now, so by induction there is
+//! always one. A short mean over the last steps bounds the jerk; a mean of vectors within a (convex) limit is within it.
+
+mod limits;
+
+pub use limits::{LimitError, LimitSettings, Limits, MAX_FILTER, ceiling};
+
+use crate::arm::Joints;
+use crate::math;
+use nalgebra::{Matrix6, Vector6};
+
+/// What held a motion back in one step, as bits.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Held(pub u16);
+
+impl Held {
+    /// The wanted rates were above a joint's speed cap.
+    pub const VELOCITY: Held = Held(1);
+    /// The wanted rates were above the gripper's speed cap.
+    pub const TCP: Held = Held(2);
+    /// A joint is close to the end of its range.
+    pub const POSITION: Held = Held(4);
+    /// The change of rates was above the acceleration limit.
+    pub const ACCELERATION: Held = Held(8);
+    /// The wanted rates were not finite numbers; the step was a stop ramp's.
+    pub const NOT_FINITE: Held = Held(16);
+    /// The step was a stop ramp's, because no step towards the wanted rates was safe.
+    pub const FALLBACK: Held = Held(32);
+    /// The wanted rates were above a compiled ceiling.
+    pub const CEILING: Held = Held(64);
+
+    /// Whether all bits of `other` are set.
+    pub const fn has(self, other: Held) -> bool {
+        self.0 & other.0 == other.0
+    }
+
+    fn add(&mut self, other: Held) {
+        self.0 |= other.0;
+    }
+}
+
+/// Rates to send, and what held them back.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Guarded {
+    /// Joint rates for the wire, rad/s.
+    pub rates: Joints,
+    /// What held the motion back.
+    pub held: Held,
+    /// Share of the wanted speed that was possible, 0 to 1.
+    pub scale: f64,
+}
+
+/// The last stage before the wire. See the module's text for what it guarantees.
+#[derive(Clone, Debug)]
+pub struct Guard {
+    limits: Limits,
+    /// Rates within all limits, before the mean.
+    raw: Joints,
+    /// What was sent last.
+    out: Joints,
+    ring: [Joints; MAX_FILTER],
+    at: usize,
+    stopping: bool,
+}
+
+/// Share of the gripper's speed cap that is aimed at: what the arm's turning adds within one filter length is kept for it.
+const TCP_AIM: f64 = 0.95;
+/// Share of the way to a joint's end at which a motion is slowed, before the fallback has to.
+const POSITION_AIM: f64 = 0.8;
+
+impl Guard {
+    /// A guard at rest.
+    pub fn new(limits: Limits) -> Self {
+        Self { limits, raw: [0.0; 6], out: [0.0; 6], ring: [[0.0; 6]; MAX_FILTER], at: 0, stopping: false }
+    }
+
+    /// The limits in force.
+    pub fn limits(&self) -> &Limits {
+        &self.limits
+    }
+
+    /// What was sent last, rad/s.
+    pub fn last(&self) -> &Joints {
+        &self.out
+    }
+
+    /// Whether what was sent last was rest.
+    pub fn at_rest(&self) -> bool {
+        self.out == [0.0; 6]
+    }
+
+    /// One step towards `wanted` (rad/s).
+    ///
+    /// `q` are measured joint positions, `jacobian` the body Jacobian at the gripper there, `share` (0 to 1) lowers the speed
+    /// caps (reduced mode, probe), `dt_s` is the real time since the last step; more than one period counts as one.
+    pub fn step(&mut self, wanted: &Joints, q: &Joints, jacobian: &Matrix6<f64>, share: f64, dt_s: f64) -> Guarded {
+        self.stopping = false;
+        let dt = self.usable(dt_s);
+        let mut held = Held::default();
+        let share = if share.is_finite() { share.clamp(0.0, 1.0) } else { 0.0 };
+        let known = q.iter().chain(jacobian.iter()).all(|v| v.is_finite());
+        if !known || wanted.iter().any(|v| !v.is_finite()) {
+            held.add(Held::NOT_FINITE);
+            self.raw = ramp(&self.raw, self.limits.acceleration * dt);
+            return Guarded { rates: self.emit(dt), held, scale: 0.0 };
+        }
+        let scale = self.possible(wanted, q, jacobian, share, &mut held);
+        let target: Joints = core::array::from_fn(|i| wanted[i] * scale);
+        let step = self.limits.acceleration * dt;
+        let change = (0..6).fold(0.0_f64, |m, i| m.max(math::fabs(target[i] - self.raw[i])));
+        let k = if change > step {
+            held.add(Held::ACCELERATION);
+            step / change
+        } else {
+            1.0
+        };
+        let candidate: Joints =
+            core::array::from_fn(|i| if k < 1.0 { self.raw[i] + k * (target[i] - self.raw[i]) } else { target[i] });
+        self.raw = if self.can_stop(&candidate, q) && self.tcp(&candidate, jacobian) <= self.limits.tcp_speed * TCP_AIM
+        {
+            candidate
+        } else {
+            held.add(Held::FALLBACK);
+            ramp(&self.raw, step)
+        };
+        Guarded { rates: self.emit(dt), held, scale }
+    }
+
+    /// One step of the stop ramp from what was sent last: all rates shrink together at the acceleration limit, their norm never
+    /// grows, and rest is reached within [`Limits::ramp_ns`] and stays.
+    ///
+    /// The first step of a stop is taken from the rates on the wire, not from inside the jerk filter, so that an arm that was
+    /// speeding up slows down at once; in that one step the jerk limit gives way to the stop.
+    pub fn stop(&mut self, dt_s: f64) -> Guarded {
+        let dt = self.usable(dt_s);
+        if !self.stopping {
+            self.stopping = true;
+            self.raw = self.out;
+            self.ring = [self.out; MAX_FILTER];
+        }
+        self.raw = ramp(&self.raw, self.limits.acceleration * dt);
+        Guarded { rates: self.emit(dt), held: Held::default(), scale: 0.0 }
+    }
+
+    fn usable(&self, dt_s: f64) -> f64 {
+        if dt_s.is_finite() { dt_s.clamp(0.0, self.limits.period_s) } else { 0.0 }
+    }
+
+    /// Greatest share of `wanted` (at most 1) that keeps speed caps and slows before the joints' ends.
+    fn possible(&self, wanted: &Joints, q: &Joints, jacobian: &Matrix6<f64>, share: f64, held: &mut Held) -> f64 {
+        let l = &self.limits;
+        let mut scale = 1.0_f64;
+        let mut fastest = 0.0_f64;
+        for i in 0..6 {
+            let speed = math::fabs(wanted[i]);
+            fastest = fastest.max(speed);
+            let cap = l.velocity[i] * share;
+            if speed * scale > cap {
+                scale = cap / speed;
+                held.add(Held::VELOCITY);
+            }
+            if speed > ceiling::VELOCITY {
+                held.add(Held::CEILING);
+            }
+        }
+        let tcp = self.tcp(wanted, jacobian);
+        let cap = l.tcp_speed * share * TCP_AIM;
+        if tcp * scale > cap {
+            scale = cap / tcp;
+            held.add(Held::TCP);
+        }
+        for i in 0..6 {
+            let v = wanted[i];
+            if v == 0.0 {
+                continue;
+            }
+            let room = if v > 0.0 { l.max[i] - q[i] } else { q[i] - l.min[i] } * POSITION_AIM;
+            if !room.is_finite() {
+                continue;
+            }
+            // With s the share, the ramp travels s² v f / 2A + s v dead; it has to be at most the room.
+            let speed = math::fabs(v);
+            let a = speed * fastest / (2.0 * l.acceleration);
+            let b = speed * self.dead_s();
+            let s = if room <= 0.0 { 0.0 } else { 2.0 * room / (b + math::sqrt(b * b + 4.0 * a * room)) };
+            if s < scale {
+                scale = s;
+                held.add(Held::POSITION);
+            }
+        }
+        if scale.is_finite() { scale.clamp(0.0, 1.0) } else { 0.0 }
+    }
+
+    /// Time at full speed before a stop takes hold: the arm's own reaction, a beat each way, the filter's delay.
+    fn dead_s(&self) -> f64 {
+        self.limits.reaction_s + self.limits.period_s * (2.0 + 0.5 * self.limits.filter as f64)
+    }
+
+    /// Whether a stop ramp from `rates` at `q` ends inside every joint's range. Motion away from an end is always allowed.
+    fn can_stop(&self, rates: &Joints, q: &Joints) -> bool {
+        let fastest = rates.iter().fold(0.0_f64, |m, v| m.max(math::fabs(*v)));
+        let seconds = fastest / (2.0 * self.limits.acceleration) + self.dead_s();
+        (0..6).all(|i| {
+            let end = q[i] + rates[i] * seconds;
+            (rates[i] <= 0.0 || end <= self.limits.max[i]) && (rates[i] >= 0.0 || end >= self.limits.min[i])
+        })
+    }
+
+    fn tcp(&self, rates: &Joints, jacobian: &Matrix6<f64>) -> f64 {
+        let xi = jacobian * Vector6::from_column_slice(rates);
+        math::sqrt(xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2])
+    }
+
+    /// Takes the mean with the last steps, bounds the change by what `dt` allows, and notes what goes out.
+    fn emit(&mut self, dt: f64) -> Joints {
+        let n = self.limits.filter.clamp(1, MAX_FILTER);
+        self.at = (self.at + 1) % n;
+        self.ring[self.at] = self.raw;
+        let mean: Joints = if self.ring[..n].iter().all(|r| *r == self.raw) {
+            self.raw
+        } else {
+            core::array::from_fn(|i| self.ring[..n].iter().map(|r| r[i]).sum::<f64>() / n as f64)
+        };
+        let change = (0..6).fold(0.0_f64, |m, i| m.max(math::fabs(mean[i] - self.out[i])));
+        let step = self.limits.acceleration * dt;
+        if change <= step {
+            self.out = mean;
+        } else {
+            let k = step / change;
+            self.out = core::array::from_fn(|i| self.out[i] + k * (mean[i] - self.out[i]));
+        }
+        self.out
+    }
+}
+
+/// `rates` with the largest brought `step` closer to zero and all others shrunk alike; rest when that crosses zero.
+fn ramp(rates: &Joints, step: f64) -> Joints {
+    let fastest = rates.iter().fold(0.0_f64, |m, v| m.max(math::fabs(*v)));
+    if !(fastest > step) {
+        // With no time passed nothing moves, not even to zero.
+        return if step > 0.0 { [0.0; 6] } else { *rates };
+    }
+    let k = 1.0 - step / fastest;
+    core::array::from_fn(|i| rates[i] * k)
+}

@@ -1,0 +1,374 @@
+//! The law: from mark errors in the pictures to the gripper's correction and velocity screw.
+//!
+//! All marks of the views in use are stacked: four rows a mark in stereo, two in one view. The stack is never stored; each mark
+//! adds its part to the weighted normal equations, so that 32 marks in two views cost 64 small products and one 6x6 solve.
+
+use super::interaction::PlacedView;
+use crate::geom::{Pixel, Twist, Vec3, View};
+use crate::math;
+use nalgebra::{Matrix2, Matrix6, SymmetricEigen, Vector6};
+
+/// Which pictures close the loop.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+pub enum ViewMode {
+    /// Both, stacked: cancels calibration errors in depth as well.
+    #[default]
+    Stereo,
+    /// The left picture only.
+    Left,
+    /// The right picture only.
+    Right,
+    /// The paper's mode: the one picture that the plan found to show the marks best.
+    Best,
+}
+
+impl ViewMode {
+    /// Whether `view` takes part, given the plan's better view.
+    pub fn uses(self, view: View, best: View) -> bool {
+        match self {
+            ViewMode::Stereo => true,
+            ViewMode::Left => view == View::Left,
+            ViewMode::Right => view == View::Right,
+            ViewMode::Best => view == best,
+        }
+    }
+}
+
+/// Where the image Jacobian is taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+pub enum JacobianAt {
+    /// At the present pose: straight paths.
+    Current,
+    /// At the reference pose: constant near the end.
+    SetPoint,
+    /// The mean of both: second order in the error.
+    #[default]
+    Mean,
+}
+
+/// Settings of the law.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LawSettings {
+    /// Pictures in use. Default: stereo.
+    pub views: ViewMode,
+    /// Where the Jacobian is taken. Default: mean.
+    pub jacobian: JacobianAt,
+    /// Gain close to the reference, 1/s. Default 2.5; above about 5 the loop rings on a 30 ms camera delay with a poor arm model.
+    pub gain_near_per_s: f64,
+    /// Gain far from it, 1/s. Default 1.0.
+    pub gain_far_per_s: f64,
+    /// Correction (unit-scaled length) at which the gain is halfway between, metres. Default 0.02.
+    pub gain_knee_m: f64,
+    /// Length that makes a turn comparable with a shift: 1 rad counts as this many metres. Default 0.1, a gripper's size.
+    pub length_m: f64,
+    /// Damping of the least squares as a singular value, pixels (rms) per metre. Default 2, far below a healthy stack's 30 to 800.
+    pub damping_px_per_m: f64,
+    /// Lowest singular value that is still acted upon, pixels (rms) per metre. Default 6.
+    pub min_sigma_px_per_m: f64,
+    /// Highest condition number that is still acted upon. Default 300.
+    pub max_condition: f64,
+    /// Fewest image points (a mark in one view is one). Default 4.
+    pub min_points: u8,
+    /// Standard deviation under which no mark is believed to lie, pixels. Default 0.02.
+    pub floor_sigma_px: f64,
+}
+
+impl Default for LawSettings {
+    fn default() -> Self {
+        Self {
+            views: ViewMode::Stereo,
+            jacobian: JacobianAt::Mean,
+            gain_near_per_s: 2.5,
+            gain_far_per_s: 1.0,
+            gain_knee_m: 0.02,
+            length_m: 0.1,
+            damping_px_per_m: 2.0,
+            min_sigma_px_per_m: 6.0,
+            max_condition: 300.0,
+            min_points: 4,
+            floor_sigma_px: 0.02,
+        }
+    }
+}
+
+impl LawSettings {
+    /// Gain for a correction of unit-scaled length `size_m`: smooth, high near the reference and low far from it.
+    pub fn gain(&self, size_m: f64) -> f64 {
+        let x = size_m / self.gain_knee_m;
+        self.gain_far_per_s + (self.gain_near_per_s - self.gain_far_per_s) * math::exp(-core::f64::consts::LN_2 * x)
+    }
+
+    /// Unit-scaled length of a small gripper motion: translation and `length_m` times the turn, metres.
+    pub fn size(&self, xi: &Twist) -> f64 {
+        let l2 = math::sq(self.length_m);
+        let (t, r) = (xi.fixed_rows::<3>(0).norm_squared(), xi.fixed_rows::<3>(3).norm_squared());
+        math::sqrt(t + l2 * r)
+    }
+}
+
+/// What the stack of marks says.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Screw {
+    /// Small gripper motion `[m; rad]` in the gripper frame that brings the marks onto the reference, by damped weighted least squares.
+    pub correction: Twist,
+    /// Root mean square distance of the marks from the reference, pixels a coordinate.
+    pub error_px: f64,
+    /// What of `error_px` no motion can remove: noise and calibration error. At rest this is the rig's health figure.
+    pub residual_px: f64,
+    /// Smallest singular value of the unit-scaled stack, pixels (rms) per metre.
+    pub sigma_min: f64,
+    /// Largest over smallest singular value.
+    pub condition: f64,
+    /// Image points used.
+    pub points: u8,
+}
+
+/// Why the stack gives no screw.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum ScrewError {
+    /// Fewer image points than asked for.
+    TooFewPoints {
+        /// Points seen and usable.
+        points: u8,
+        /// Points needed.
+        needed: u8,
+    },
+    /// The marks seen do not fix all six components of the motion.
+    IllConditioned {
+        /// Smallest singular value, pixels per metre.
+        sigma_min: f64,
+        /// Condition number.
+        condition: f64,
+    },
+    /// Something in the stack is not a finite number.
+    NotFinite,
+}
+
+/// One mark in one view, as the law takes it.
+#[derive(Clone, Copy, Debug)]
+pub struct MarkError {
+    /// Where the mark is now, pixels.
+    pub now: Pixel,
+    /// Where it should be now, pixels.
+    pub reference: Pixel,
+    /// Covariance of `now`, px².
+    pub covariance: Matrix2<f64>,
+    /// Extra weight, 0 to 1.
+    pub factor: f64,
+}
+
+/// The stack while it is being filled.
+#[derive(Clone, Copy, Debug)]
+pub struct Stack {
+    settings: LawSettings,
+    h: Matrix6<f64>,
+    g: Vector6<f64>,
+    weight: f64,
+    squares: f64,
+    plain_squares: f64,
+    points: u8,
+}
+
+impl Stack {
+    /// An empty stack.
+    pub fn new(settings: &LawSettings) -> Self {
+        Self {
+            settings: *settings,
+            h: Matrix6::zeros(),
+            g: Vector6::zeros(),
+            weight: 0.0,
+            squares: 0.0,
+            plain_squares: 0.0,
+            points: 0,
+        }
+    }
+
+    /// Adds the mark at `x_gripper` as one view sees it with the gripper at its present pose (`current`) and at the reference
+    /// pose (`reference`). A mark that cannot be projected, or whose numbers are not finite, adds nothing.
+    pub fn add(&mut self, current: &PlacedView, reference: &PlacedView, x_gripper: &Vec3, mark: &MarkError) {
+        let l = match self.settings.jacobian {
+            JacobianAt::Current => current.interaction(x_gripper).map(|(_, l)| l),
+            JacobianAt::SetPoint => reference.interaction(x_gripper).map(|(_, l)| l),
+            JacobianAt::Mean => current
+                .interaction(x_gripper)
+                .and_then(|(_, a)| reference.interaction(x_gripper).map(|(_, b)| (a + b) * 0.5)),
+        };
+        let Some(mut l) = l else { return };
+        // Unit-scaled columns: the unknown is [v; length * w], all metres.
+        for k in 3..6 {
+            l[(0, k)] /= self.settings.length_m;
+            l[(1, k)] /= self.settings.length_m;
+        }
+        let Some(w) = information(&mark.covariance, self.settings.floor_sigma_px) else { return };
+        let w = w * mark.factor;
+        let e = mark.now - mark.reference;
+        let trace = w[(0, 0)] + w[(1, 1)];
+        if !(trace.is_finite() && trace > 0.0 && e.x.is_finite() && e.y.is_finite()) || l.iter().any(|v| !v.is_finite())
+        {
+            return;
+        }
+        let wl = w * l;
+        self.h += l.tr_mul(&wl);
+        self.g += wl.tr_mul(&e);
+        self.weight += trace;
+        self.squares += e.dot(&(w * e));
+        self.plain_squares += e.norm_squared();
+        self.points = self.points.saturating_add(1);
+    }
+
+    /// Solves the stack.
+    ///
+    /// # Errors
+    /// [`ScrewError`]: too few points, rank or condition outside the settings, or a number that is not finite.
+    pub fn solve(&self) -> Result<Screw, ScrewError> {
+        let s = &self.settings;
+        if self.points < s.min_points {
+            return Err(ScrewError::TooFewPoints { points: self.points, needed: s.min_points });
+        }
+        // Divided by the total weight the matrix is the mean square pixel motion for a unit of unit-scaled motion.
+        let h = self.h / self.weight;
+        let g = self.g / self.weight;
+        if h.iter().chain(g.iter()).any(|v| !v.is_finite()) {
+            return Err(ScrewError::NotFinite);
+        }
+        let eigen = SymmetricEigen::try_new(h, 1e-12, 200).ok_or(ScrewError::NotFinite)?;
+        let low = eigen.eigenvalues.min().max(0.0);
+        let high = eigen.eigenvalues.max().max(0.0);
+        let sigma_min = math::sqrt(low);
+        let condition = if low > 0.0 { math::sqrt(high / low) } else { f64::INFINITY };
+        if sigma_min < s.min_sigma_px_per_m || condition > s.max_condition {
+            return Err(ScrewError::IllConditioned { sigma_min, condition });
+        }
+        let damped = h + Matrix6::identity() * math::sq(s.damping_px_per_m);
+        let x = damped.cholesky().ok_or(ScrewError::IllConditioned { sigma_min, condition })?.solve(&g);
+        let mut correction = -x;
+        for k in 3..6 {
+            correction[k] /= s.length_m;
+        }
+        if correction.iter().any(|v| !v.is_finite()) {
+            return Err(ScrewError::NotFinite);
+        }
+        // Explained part of the weighted squares: 2 g.x - x.Hx; what is left, per unit of weight, in px².
+        let explained = 2.0 * g.dot(&x) - x.dot(&(h * x));
+        let left = (self.squares / self.weight - explained).max(0.0);
+        let rows = 2.0 * f64::from(self.points);
+        Ok(Screw {
+            correction,
+            error_px: math::sqrt(self.plain_squares / rows),
+            residual_px: math::sqrt(left),
+            sigma_min,
+            condition,
+            points: self.points,
+        })
+    }
+}
+
+/// Inverse of a covariance with a floor; `None` when it is not a covariance.
+fn information(c: &Matrix2<f64>, floor: f64) -> Option<Matrix2<f64>> {
+    let f = math::sq(floor);
+    let (a, b, d) = (c[(0, 0)] + f, 0.5 * (c[(0, 1)] + c[(1, 0)]), c[(1, 1)] + f);
+    let det = a * d - b * b;
+    (a > 0.0 && det > 0.0 && det.is_finite()).then(|| Matrix2::new(d, -b, -b, a) / det)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geom::{Camera, Distortion, Pose, exp_twist};
+
+    fn camera() -> Camera {
+        Camera {
+            width: 1280,
+            height: 1024,
+            fx: 1200.0,
+            fy: 1200.0,
+            cx: 640.0,
+            cy: 512.0,
+            distortion: Distortion { k1: -0.1, ..Default::default() },
+        }
+    }
+
+    fn marks() -> [Vec3; 6] {
+        core::array::from_fn(|i| {
+            let a = i as f64;
+            Vec3::new(0.05 * math::sin(a * 1.7), 0.05 * math::cos(a * 2.3), -0.05 - 0.02 * math::sin(a * 3.1))
+        })
+    }
+
+    fn stack(settings: &LawSettings, now: &Pose, goal: &Pose, points: &[Vec3]) -> Stack {
+        let cam = camera();
+        let right = exp_twist(&Twist::new(-0.5, 0.02, 0.1, 0.01, 0.33, -0.02));
+        let mut s = Stack::new(settings);
+        for (view, place) in [(View::Left, Pose::identity()), (View::Right, right)] {
+            if !settings.views.uses(view, View::Left) {
+                continue;
+            }
+            let (a, b) = (PlacedView::new(&cam, &(place * now)), PlacedView::new(&cam, &(place * goal)));
+            for x in points {
+                let mark = MarkError {
+                    now: a.project(x).unwrap(),
+                    reference: b.project(x).unwrap(),
+                    covariance: Matrix2::identity() * 0.01,
+                    factor: 1.0,
+                };
+                s.add(&a, &b, x, &mark);
+            }
+        }
+        s
+    }
+
+    #[test]
+    fn the_correction_leads_to_the_goal_in_every_view_mode() {
+        let goal = Pose::translation(0.05, -0.04, 1.5) * exp_twist(&Twist::new(0.0, 0.0, 0.0, 2.6, 0.3, 0.2));
+        for views in [ViewMode::Stereo, ViewMode::Left, ViewMode::Right, ViewMode::Best] {
+            for jacobian in [JacobianAt::Current, JacobianAt::SetPoint, JacobianAt::Mean] {
+                let settings = LawSettings { views, jacobian, damping_px_per_m: 0.01, ..Default::default() };
+                let off = Twist::new(0.004, -0.003, 0.005, 0.01, -0.02, 0.015);
+                let now = goal * exp_twist(&off);
+                let s = stack(&settings, &now, &goal, &marks()).solve().unwrap();
+                assert!((s.correction + off).norm() < 0.06 * off.norm(), "{views:?} {jacobian:?} {}", s.correction);
+                assert!(s.residual_px < 0.1 * s.error_px);
+            }
+        }
+    }
+
+    #[test]
+    fn too_few_or_collinear_marks_are_refused_with_figures() {
+        let goal = Pose::translation(0.0, 0.0, 1.5);
+        let s = LawSettings { views: ViewMode::Left, ..Default::default() };
+        let two = [Vec3::zeros(), Vec3::new(0.05, 0.0, 0.0)];
+        assert_eq!(stack(&s, &goal, &goal, &two).solve(), Err(ScrewError::TooFewPoints { points: 2, needed: 4 }));
+        let line: [Vec3; 5] = core::array::from_fn(|i| Vec3::new(0.02 * i as f64, 0.0, 0.0));
+        let e = stack(&LawSettings::default(), &goal, &goal, &line).solve();
+        assert!(matches!(e, Err(ScrewError::IllConditioned { .. })), "a line of marks leaves its own turn free: {e:?}");
+    }
+
+    #[test]
+    fn numbers_that_are_none_add_nothing() {
+        let goal = Pose::translation(0.0, 0.0, 1.5);
+        let cam = camera();
+        let view = PlacedView::new(&cam, &goal);
+        let mut s = Stack::new(&LawSettings::default());
+        let bad = MarkError {
+            now: Pixel::new(f64::NAN, 0.0),
+            reference: Pixel::zeros(),
+            covariance: Matrix2::identity(),
+            factor: 1.0,
+        };
+        s.add(&view, &view, &Vec3::zeros(), &bad);
+        s.add(
+            &view,
+            &view,
+            &Vec3::zeros(),
+            &MarkError { now: Pixel::zeros(), covariance: -Matrix2::identity(), ..bad },
+        );
+        assert_eq!(s.solve(), Err(ScrewError::TooFewPoints { points: 0, needed: 4 }));
+    }
+
+    #[test]
+    fn gain_rises_towards_the_goal() {
+        let s = LawSettings::default();
+        assert!((s.gain(0.0) - s.gain_near_per_s).abs() < 1e-12);
+        assert!(s.gain(0.01) > s.gain(0.05) && (s.gain(1.0) - s.gain_far_per_s).abs() < 1e-6);
+    }
+}
