@@ -1,0 +1,5 @@
+//! The command line: one file a subcommand.
+
+mod args;
+
+pub use args::{Cli, Command};

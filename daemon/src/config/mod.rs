@@ -1,0 +1,7 @@
+//! graspd.toml: serde mirrors in `raw`, checked values in `settings`; nothing downstream validates again.
+
+mod raw;
+mod settings;
+
+pub use raw::{RawArm, RawConfig, RawConverged, RawFiles, RawLimits, RawLoop, RawServo, RawShm, RawVision};
+pub use settings::{Config, Kinematics, LinkKind, names};

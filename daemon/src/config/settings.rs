@@ -1,0 +1,154 @@
+//! From the file's text to values that are valid.
+
+use super::raw::RawConfig;
+use crate::exit::Failure;
+use graspd_calib::files::{GripperFile, RigFile};
+use graspd_rt::arm::Model;
+use graspd_shm::Names;
+use std::path::{Path, PathBuf};
+
+/// Which arm.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LinkKind {
+    /// A UR controller over RTDE.
+    Rtde,
+    /// The arm inside the daemon.
+    Mock,
+}
+
+/// Where the arm's kinematics come from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Kinematics {
+    /// The controller's own calibration, read from its primary interface.
+    Controller,
+    /// The model's published values.
+    Nominal,
+    /// A file.
+    File(PathBuf),
+}
+
+/// A configuration in which every value is in range and every named file was read.
+#[derive(Clone, Debug)]
+pub struct Config {
+    /// The file's values; all numbers are checked.
+    pub raw: RawConfig,
+    /// Names of the shared-memory services.
+    pub names: Names,
+    /// The rig.
+    pub rig: RigFile,
+    /// The gripper.
+    pub gripper: GripperFile,
+    /// Which arm.
+    pub link: LinkKind,
+    /// Which model.
+    pub model: Model,
+    /// Where its kinematics come from.
+    pub kinematics: Kinematics,
+}
+
+/// Shared-memory names of a cell under a root folder, or under the user's own.
+///
+/// # Errors
+/// A cell name or folder that cannot be used.
+pub fn names(cell: &str, root: Option<&Path>) -> Result<Names, Failure> {
+    match root {
+        Some(root) => Names::new(root, &Names::default_prefix(), cell),
+        None => Names::default_for_user(cell),
+    }
+    .map_err(|e| Failure::input(e.to_string()))
+}
+
+impl Config {
+    /// Reads and checks a configuration and every file it names.
+    ///
+    /// # Errors
+    /// Names the file, the key, the value and the fix.
+    pub fn load(path: &Path) -> Result<Self, Failure> {
+        let shown = path.display();
+        let text = std::fs::read_to_string(path)
+            .map_err(|e| Failure::input(format!("{shown}: cannot be read ({e}); docs/CONFIG.md has an example to start from")))?;
+        let raw: RawConfig = toml::from_str(&text).map_err(|e| Failure::input(format!("{shown}: {e}\nSee docs/CONFIG.md for every key.")))?;
+        check_numbers(path, &raw)?;
+        let folder = path.parent().unwrap_or(Path::new("."));
+        let names = names(&raw.cell, raw.shm.root.as_deref().map(|r| folder.join(r)).as_deref())
+            .map_err(|e| Failure::input(format!("{shown}: {e}")))?;
+        let rig = RigFile::load(&folder.join(&raw.files.rig)).map_err(|e| Failure::input(e.to_string()))?;
+        let gripper = GripperFile::load(&folder.join(&raw.files.gripper)).map_err(|e| Failure::input(e.to_string()))?;
+        let link = match raw.arm.link.as_str() {
+            "rtde" => LinkKind::Rtde,
+            "mock" => LinkKind::Mock,
+            other => return Err(bad(path, "arm.link", other, "use \"rtde\" or \"mock\"")),
+        };
+        let model = Model::from_name(&raw.arm.model)
+            .ok_or_else(|| bad(path, "arm.model", &raw.arm.model, "use ur3, ur5, ur10, ur3e, ur5e, ur10e, ur16e, ur20 or ur30"))?;
+        let kinematics = match raw.arm.kinematics.as_str() {
+            "controller" => Kinematics::Controller,
+            "nominal" => Kinematics::Nominal,
+            file => Kinematics::File(folder.join(file)),
+        };
+        one_of(path, "arm.motion", &raw.arm.motion, &["velocity", "position"])?;
+        one_of(path, "servo.views", &raw.servo.views, &["stereo", "left", "right", "best"])?;
+        one_of(path, "servo.jacobian", &raw.servo.jacobian, &["current", "desired", "mean"])?;
+        Ok(Self { raw, names, rig, gripper, link, model, kinematics })
+    }
+
+    /// Period of the command thread's beat, nanoseconds.
+    pub fn period_ns(&self) -> u64 {
+        // check_numbers keeps the rate in 50..=1000 Hz.
+        (1e9 / self.raw.beat.rate_hz).round() as u64
+    }
+}
+
+fn bad(path: &Path, key: &str, value: &str, fix: &str) -> Failure {
+    Failure::input(format!("{}: {key} = \"{value}\": {fix}", path.display()))
+}
+
+fn one_of(path: &Path, key: &str, value: &str, allowed: &[&str]) -> Result<(), Failure> {
+    if allowed.contains(&value) {
+        return Ok(());
+    }
+    Err(bad(path, key, value, &format!("use one of: {}", allowed.join(", "))))
+}
+
+/// Every number with its range: finite, and inside what the arm, the host or the law can do.
+fn check_numbers(path: &Path, c: &RawConfig) -> Result<(), Failure> {
+    let ranges: &[(&str, f64, f64, f64)] = &[
+        ("arm.watchdog_ms", c.arm.watchdog_ms, 20.0, 200.0),
+        ("loop.rate_hz", c.beat.rate_hz, 50.0, 1000.0),
+        ("loop.command_priority", f64::from(c.beat.command_priority), 0.0, 98.0),
+        ("loop.vision_priority", f64::from(c.beat.vision_priority), 0.0, 97.0),
+        ("loop.spin_us", c.beat.spin_us, 0.0, 4000.0),
+        ("vision.poll_us", c.vision.poll_us, 100.0, 20_000.0),
+        ("vision.frame_rate_hz", c.vision.frame_rate_hz, 1.0, 1000.0),
+        ("vision.max_skew_ms", c.vision.max_skew_ms, 0.0, 100.0),
+        ("vision.min_observations", c.vision.min_observations as f64, 3.0, 64.0),
+        ("servo.gain", c.servo.gain, 0.05, 20.0),
+        ("servo.gain_near", c.servo.gain_near, 0.05, 20.0),
+        ("servo.path_speed_m_s", c.servo.path_speed_m_s, 0.001, 1.0),
+        ("servo.path_speed_rad_s", c.servo.path_speed_rad_s, 0.001, 3.0),
+        ("converged.error_px", c.converged.error_px, 0.01, 20.0),
+        ("converged.distance_m", c.converged.distance_m, 1e-5, 0.1),
+        ("converged.angle_rad", c.converged.angle_rad, 1e-4, 0.5),
+        ("converged.frames", f64::from(c.converged.frames), 1.0, 10_000.0),
+        ("limits.joint_speed_rad_s", c.limits.joint_speed_rad_s, 0.001, 3.2),
+        ("limits.joint_accel_rad_s2", c.limits.joint_accel_rad_s2, 0.01, 40.0),
+        ("limits.joint_jerk_rad_s3", c.limits.joint_jerk_rad_s3, 0.1, 10_000.0),
+        ("limits.stop_accel_rad_s2", c.limits.stop_accel_rad_s2, 0.1, 40.0),
+        ("limits.tcp_speed_m_s", c.limits.tcp_speed_m_s, 0.001, 1.0),
+        ("limits.joint_margin_rad", c.limits.joint_margin_rad, 0.0, 1.0),
+    ];
+    for (key, value, low, high) in ranges {
+        if !(value.is_finite() && value >= low && value <= high) {
+            return Err(bad(path, key, &value.to_string(), &format!("must lie between {low} and {high}")));
+        }
+    }
+    if c.beat.vision_priority >= c.beat.command_priority && c.beat.vision_priority > 0 {
+        return Err(bad(
+            path,
+            "loop.vision_priority",
+            &c.beat.vision_priority.to_string(),
+            "must lie below loop.command_priority, so that tracking never delays the arm's beat",
+        ));
+    }
+    Ok(())
+}

@@ -1,0 +1,85 @@
+//! Requests to the daemon and its answers: a verb in a fixed header, text as payload.
+
+use iceoryx2::prelude::ZeroCopySend;
+
+/// "GREQ" in ASCII.
+pub const REQUEST_MAGIC: u32 = u32::from_le_bytes(*b"GREQ");
+/// Layout version of both headers.
+pub const REQUEST_VERSION: u32 = 1;
+/// The longest payload of a request, bytes: a plan file.
+pub const REQUEST_MAX_BYTES: usize = 128 * 1024;
+/// The longest payload of an answer, bytes.
+pub const ANSWER_MAX_BYTES: usize = 64 * 1024;
+
+/// What is asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verb {
+    /// 1: report the state; changes nothing.
+    Status,
+    /// 2: allow motion to be started; moves nothing.
+    Arm,
+    /// 3: start servoing.
+    Servo,
+    /// 4: ramp down to rest.
+    Stop,
+    /// 5: clear a latched fault; moves nothing.
+    Reset,
+    /// 6: offer a set-point; the payload is a plan file's text.
+    Setpoint,
+    /// 7: walk the controller out of a protective stop; ends idle.
+    Recover,
+}
+
+impl Verb {
+    /// The number in the header.
+    pub fn number(self) -> u32 {
+        match self {
+            Verb::Status => 1,
+            Verb::Arm => 2,
+            Verb::Servo => 3,
+            Verb::Stop => 4,
+            Verb::Reset => 5,
+            Verb::Setpoint => 6,
+            Verb::Recover => 7,
+        }
+    }
+
+    /// The verb of a number.
+    pub fn from_number(n: u32) -> Option<Self> {
+        [Verb::Status, Verb::Arm, Verb::Servo, Verb::Stop, Verb::Reset, Verb::Setpoint, Verb::Recover]
+            .into_iter()
+            .find(|v| v.number() == n)
+    }
+}
+
+/// User header of a request.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
+#[type_name("GraspdRequestHeader")]
+pub struct RequestHeader {
+    /// [`REQUEST_MAGIC`].
+    pub magic: u32,
+    /// [`REQUEST_VERSION`].
+    pub layout_version: u32,
+    /// [`Verb::number`].
+    pub verb: u32,
+    /// Bytes of the payload that count; the rest is padding.
+    pub length: u32,
+    /// When the request was made, CLOCK_MONOTONIC nanoseconds. Verbs that start motion are refused when older than 250 ms.
+    pub stamp_ns: u64,
+}
+
+/// User header of an answer.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
+#[type_name("GraspdAnswerHeader")]
+pub struct AnswerHeader {
+    /// [`REQUEST_MAGIC`].
+    pub magic: u32,
+    /// [`REQUEST_VERSION`].
+    pub layout_version: u32,
+    /// 0 accepted, 1 refused, 2 malformed.
+    pub status: u32,
+    /// Bytes of the payload that count: one JSON object.
+    pub length: u32,
+}

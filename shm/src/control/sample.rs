@@ -1,0 +1,173 @@
+//! The telemetry sample: what the loop did, in fixed layout (shm/CONTROL.md is the page for outsiders).
+
+use iceoryx2::prelude::ZeroCopySend;
+
+/// "GTEL" in ASCII, the first four bytes of every sample.
+pub const TELEMETRY_MAGIC: u32 = u32::from_le_bytes(*b"GTEL");
+/// Layout version of [`TelemetrySample`].
+pub const TELEMETRY_VERSION: u32 = 1;
+/// Marks a sample can carry.
+pub const TELEMETRY_MARKS: usize = 32;
+/// Bytes of the text fields.
+pub const TELEMETRY_TEXT: usize = 256;
+
+/// Percentiles of one latency since the last arming, microseconds.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
+#[type_name("GraspdPercentiles")]
+#[allow(missing_docs)]
+pub struct Percentiles {
+    pub p50: f32,
+    pub p99: f32,
+    pub p999: f32,
+    pub max: f32,
+}
+
+/// One telemetry sample, published 50 times a second by an ordinary thread of the daemon.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, ZeroCopySend)]
+#[type_name("GraspdTelemetry")]
+pub struct TelemetrySample {
+    /// [`TELEMETRY_MAGIC`].
+    pub magic: u32,
+    /// [`TELEMETRY_VERSION`].
+    pub layout_version: u32,
+    /// Counts samples.
+    pub sequence: u64,
+    /// CLOCK_MONOTONIC nanoseconds of the beat this sample describes.
+    pub stamp_ns: u64,
+    /// 0 idle, 1 tracking, 2 armed, 3 servoing, 4 converged, 5 stopping, 6 fault.
+    pub state: u32,
+    /// Stable number of the latched fault; 0 none.
+    pub fault: u32,
+    /// Step of the task: 0 none, 1 to pre-grasp, 2 to grasp, 3 hold, 4 close, 5 turn, 6 retreat.
+    pub phase: u32,
+    /// 0 stereo, 1 left, 2 right, 3 best.
+    pub views: u32,
+    /// Beats of the command thread since start.
+    pub ticks: u64,
+    /// Beats that came a whole period late or later.
+    pub overruns: u64,
+    /// Stereo pairs tracked.
+    pub frames: u64,
+    /// Stereo pairs that were never seen because a newer one was there.
+    pub frames_skipped: u64,
+    /// Stereo pairs refused by a check.
+    pub frames_refused: u64,
+    /// Identity of the set-point; 0 none.
+    pub setpoint: u64,
+    /// 0 down, 1 connecting, 2 up.
+    pub link: u32,
+    /// The controller's robot mode; 7 is running.
+    pub robot_mode: i32,
+    /// The controller's safety status bits.
+    pub safety_bits: u32,
+    /// Bit set of the limits that shaped this beat's command.
+    pub limits_active: u32,
+    /// Measured joint positions, rad.
+    pub q: [f64; 6],
+    /// Measured joint velocities, rad/s.
+    pub qd: [f64; 6],
+    /// Commanded joint velocities, rad/s.
+    pub command: [f64; 6],
+    /// Commanded screw in the gripper frame, m/s and rad/s.
+    pub screw: [f64; 6],
+    /// Gripper in the left camera's frame: x, y, z, then quaternion w, x, y, z.
+    pub left_from_gripper: [f64; 7],
+    /// Root mean square of the image error of all marks against the present goal, px; NaN without one.
+    pub error_px: f64,
+    /// Residual of the pose fit, px: the health figure of the calibration at rest.
+    pub residual_px: f64,
+    /// Distance to the goal by the daemon's own estimate, m; NaN without one.
+    pub distance_m: f64,
+    /// Angle to the goal by the daemon's own estimate, rad; NaN without one.
+    pub angle_rad: f64,
+    /// Condition number of the stacked image Jacobian (unit-scaled).
+    pub condition: f64,
+    /// Gain of the law, 1/s.
+    pub gain: f64,
+    /// Marks of the gripper.
+    pub mark_count: u32,
+    /// Marks seen, left and right.
+    pub marks_seen: [u32; 2],
+    /// Zero.
+    pub reserved: u32,
+    /// Seen marks by view and index, px; NaN where not seen.
+    pub marks: [[[f32; 2]; TELEMETRY_MARKS]; 2],
+    /// Goal of each mark by view and index, px; NaN where none.
+    pub goals: [[[f32; 2]; TELEMETRY_MARKS]; 2],
+    /// How late the command thread woke.
+    pub wakeup_us: Percentiles,
+    /// Length of the command thread's work.
+    pub compute_us: Percentiles,
+    /// From the exposure of a pair to the first command that used it.
+    pub frame_to_command_us: Percentiles,
+    /// From a command to its echo by the control script.
+    pub round_trip_us: Percentiles,
+    /// Fault code and cause, UTF-8, zero-padded.
+    pub cause: [u8; TELEMETRY_TEXT],
+}
+
+impl Default for TelemetrySample {
+    fn default() -> Self {
+        Self {
+            magic: TELEMETRY_MAGIC,
+            layout_version: TELEMETRY_VERSION,
+            sequence: 0,
+            stamp_ns: 0,
+            state: 0,
+            fault: 0,
+            phase: 0,
+            views: 0,
+            ticks: 0,
+            overruns: 0,
+            frames: 0,
+            frames_skipped: 0,
+            frames_refused: 0,
+            setpoint: 0,
+            link: 0,
+            robot_mode: -1,
+            safety_bits: 0,
+            limits_active: 0,
+            q: [0.0; 6],
+            qd: [0.0; 6],
+            command: [0.0; 6],
+            screw: [0.0; 6],
+            left_from_gripper: [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0],
+            error_px: f64::NAN,
+            residual_px: f64::NAN,
+            distance_m: f64::NAN,
+            angle_rad: f64::NAN,
+            condition: f64::NAN,
+            gain: 0.0,
+            mark_count: 0,
+            marks_seen: [0; 2],
+            reserved: 0,
+            marks: [[[f32::NAN; 2]; TELEMETRY_MARKS]; 2],
+            goals: [[[f32::NAN; 2]; TELEMETRY_MARKS]; 2],
+            wakeup_us: Percentiles::default(),
+            compute_us: Percentiles::default(),
+            frame_to_command_us: Percentiles::default(),
+            round_trip_us: Percentiles::default(),
+            cause: [0; TELEMETRY_TEXT],
+        }
+    }
+}
+
+impl TelemetrySample {
+    /// The cause text, up to its first zero byte; empty when it is not UTF-8.
+    pub fn cause_text(&self) -> &str {
+        let end = self.cause.iter().position(|&b| b == 0).unwrap_or(self.cause.len());
+        std::str::from_utf8(&self.cause[..end]).unwrap_or("")
+    }
+
+    /// Sets the cause text, cut at a character boundary when it is too long.
+    pub fn set_cause(&mut self, text: &str) {
+        self.cause = [0; TELEMETRY_TEXT];
+        let mut end = text.len().min(TELEMETRY_TEXT - 1);
+        while !text.is_char_boundary(end) {
+            end -= 1;
+        }
+        self.cause[..end].copy_from_slice(&text.as_bytes()[..end]);
+    }
+}

@@ -1,0 +1,92 @@
+//! The telemetry topic.
+
+use super::sample::{TELEMETRY_MAGIC, TELEMETRY_VERSION, TelemetrySample};
+use super::verbs::ControlError;
+use crate::ShmNode;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::prelude::*;
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+
+/// Samples a slow reader may fall behind before it misses some.
+const BUFFER: usize = 8;
+/// Readers at once: console, recorder, metrics, command line tools.
+const SUBSCRIBERS: usize = 16;
+
+fn open(node: &ShmNode) -> Result<PortFactory<ipc::Service, TelemetrySample, ()>, ControlError> {
+    let name = node.service("telemetry");
+    let parsed = ServiceName::new(&name).map_err(|e| ControlError::open(&name, &e))?;
+    node.node()
+        .service_builder(&parsed)
+        .publish_subscribe::<TelemetrySample>()
+        .history_size(1)
+        .subscriber_max_buffer_size(BUFFER)
+        .subscriber_max_borrowed_samples(2)
+        .max_publishers(2)
+        .max_subscribers(SUBSCRIBERS)
+        .enable_safe_overflow(true)
+        .open_or_create()
+        .map_err(|e| ControlError::open(&name, &e))
+}
+
+/// Publishes telemetry. Sending allocates inside iceoryx2: never from a real-time thread.
+#[derive(Debug)]
+pub struct TelemetryPublisher {
+    publisher: Publisher<ipc::Service, TelemetrySample, ()>,
+    _service: PortFactory<ipc::Service, TelemetrySample, ()>,
+}
+
+impl TelemetryPublisher {
+    /// Opens or creates the topic.
+    ///
+    /// # Errors
+    /// When the topic exists with another layout, or shared memory is refused.
+    pub fn new(node: &ShmNode) -> Result<Self, ControlError> {
+        let service = open(node)?;
+        let publisher = service.publisher_builder().create().map_err(|e| ControlError::open("telemetry", &e))?;
+        Ok(Self { publisher, _service: service })
+    }
+
+    /// Publishes one sample.
+    ///
+    /// # Errors
+    /// When shared memory fails underneath; the next call may succeed.
+    pub fn publish(&self, sample: &TelemetrySample) -> Result<(), ControlError> {
+        let loan = self.publisher.loan_uninit().map_err(|e| ControlError::io("telemetry", &e))?;
+        loan.write_payload(*sample).send().map_err(|e| ControlError::io("telemetry", &e))?;
+        Ok(())
+    }
+}
+
+/// Reads telemetry.
+#[derive(Debug)]
+pub struct TelemetrySubscriber {
+    subscriber: Subscriber<ipc::Service, TelemetrySample, ()>,
+    _service: PortFactory<ipc::Service, TelemetrySample, ()>,
+}
+
+impl TelemetrySubscriber {
+    /// Opens or creates the topic.
+    ///
+    /// # Errors
+    /// When the topic exists with another layout, or shared memory is refused.
+    pub fn new(node: &ShmNode) -> Result<Self, ControlError> {
+        let service = open(node)?;
+        let subscriber = service.subscriber_builder().create().map_err(|e| ControlError::open("telemetry", &e))?;
+        Ok(Self { subscriber, _service: service })
+    }
+
+    /// The oldest unread sample, if there is one. Samples of another layout version are an error, never trusted.
+    ///
+    /// # Errors
+    /// When shared memory fails, or the publisher speaks another version.
+    pub fn next(&self) -> Result<Option<TelemetrySample>, ControlError> {
+        let Some(sample) = self.subscriber.receive().map_err(|e| ControlError::io("telemetry", &e))? else {
+            return Ok(None);
+        };
+        if sample.magic != TELEMETRY_MAGIC || sample.layout_version != TELEMETRY_VERSION {
+            return Err(ControlError::Version { service: "telemetry", found: sample.layout_version, expected: TELEMETRY_VERSION });
+        }
+        Ok(Some(*sample))
+    }
+}

@@ -1,0 +1,241 @@
+//! The request service: verbs in, JSON answers out.
+
+use super::request::{
+    ANSWER_MAX_BYTES, AnswerHeader, REQUEST_MAGIC, REQUEST_MAX_BYTES, REQUEST_VERSION, RequestHeader, Verb,
+};
+use crate::ShmNode;
+use iceoryx2::active_request::ActiveRequest;
+use iceoryx2::port::client::Client;
+use iceoryx2::port::server::Server;
+use iceoryx2::prelude::*;
+use iceoryx2::service::port_factory::request_response::PortFactory;
+use std::time::{Duration, Instant};
+
+type Factory = PortFactory<ipc::Service, [u8], RequestHeader, [u8], AnswerHeader>;
+
+/// What can go wrong with telemetry and requests.
+#[derive(Debug, thiserror::Error)]
+pub enum ControlError {
+    /// A service could not be opened.
+    #[error(
+        "shared-memory service '{service}' could not be opened ({cause}); is a program of another version running in this cell, or is the shared-memory root not yours?"
+    )]
+    Open {
+        /// Which service.
+        service: String,
+        /// What iceoryx2 said.
+        cause: String,
+    },
+    /// A send or receive failed.
+    #[error("shared-memory service '{service}' failed ({cause})")]
+    Io {
+        /// Which service.
+        service: &'static str,
+        /// What iceoryx2 said.
+        cause: String,
+    },
+    /// The other side speaks another layout.
+    #[error("service '{service}' speaks layout version {found}, this program {expected}; run programs of one version")]
+    Version {
+        /// Which service.
+        service: &'static str,
+        /// Its version.
+        found: u32,
+        /// Ours.
+        expected: u32,
+    },
+    /// Nobody answers.
+    #[error("no daemon answers in this cell; start it with 'graspd run', or name its cell and shared-memory root")]
+    NoDaemon,
+    /// The payload is longer than the service carries.
+    #[error("the request is {length} bytes long; at most {limit} fit")]
+    TooLong {
+        /// Its length.
+        length: usize,
+        /// The limit.
+        limit: usize,
+    },
+}
+
+impl ControlError {
+    pub(super) fn open(service: &str, cause: &dyn std::fmt::Debug) -> Self {
+        ControlError::Open { service: service.to_owned(), cause: format!("{cause:?}") }
+    }
+
+    pub(super) fn io(service: &'static str, cause: &dyn std::fmt::Debug) -> Self {
+        ControlError::Io { service, cause: format!("{cause:?}") }
+    }
+}
+
+fn open(node: &ShmNode) -> Result<Factory, ControlError> {
+    let name = node.service("requests");
+    let parsed = ServiceName::new(&name).map_err(|e| ControlError::open(&name, &e))?;
+    node.node()
+        .service_builder(&parsed)
+        .request_response::<[u8], [u8]>()
+        .request_user_header::<RequestHeader>()
+        .response_user_header::<AnswerHeader>()
+        .max_servers(1)
+        .max_clients(16)
+        .max_active_requests_per_client(1)
+        .max_response_buffer_size(2)
+        .open_or_create()
+        .map_err(|e| ControlError::open(&name, &e))
+}
+
+/// An answer of the daemon.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Answer {
+    /// Whether the request was accepted.
+    pub accepted: bool,
+    /// One JSON object.
+    pub json: String,
+}
+
+/// Asks the daemon.
+#[derive(Debug)]
+pub struct RequestClient {
+    client: Client<ipc::Service, [u8], RequestHeader, [u8], AnswerHeader>,
+    service: Factory,
+}
+
+impl RequestClient {
+    /// Opens or creates the service.
+    ///
+    /// # Errors
+    /// When the service exists with another layout, or shared memory is refused.
+    pub fn new(node: &ShmNode) -> Result<Self, ControlError> {
+        let service = open(node)?;
+        let client = service
+            .client_builder()
+            .initial_max_slice_len(REQUEST_MAX_BYTES)
+            .create()
+            .map_err(|e| ControlError::open("requests", &e))?;
+        Ok(Self { client, service })
+    }
+
+    /// Sends one request and waits for its answer, at most `timeout`.
+    ///
+    /// # Errors
+    /// [`ControlError::NoDaemon`] when nobody answered in time.
+    pub fn ask(&self, verb: Verb, payload: &[u8], stamp_ns: u64, timeout: Duration) -> Result<Answer, ControlError> {
+        if payload.len() > REQUEST_MAX_BYTES {
+            return Err(ControlError::TooLong { length: payload.len(), limit: REQUEST_MAX_BYTES });
+        }
+        let until = Instant::now() + timeout;
+        // A request that finds no server is dropped by iceoryx2, so wait for one before sending; a motion verb is sent once.
+        while self.service.dynamic_config().number_of_servers() == 0 {
+            if Instant::now() >= until {
+                return Err(ControlError::NoDaemon);
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let mut loan = self.client.loan_slice_uninit(payload.len().max(1)).map_err(|e| ControlError::io("requests", &e))?;
+        *loan.user_header_mut() = RequestHeader {
+            magic: REQUEST_MAGIC,
+            layout_version: REQUEST_VERSION,
+            verb: verb.number(),
+            length: u32::try_from(payload.len()).unwrap_or(0),
+            stamp_ns,
+        };
+        let filled = loan.write_from_fn(|i| payload.get(i).copied().unwrap_or(0));
+        let pending = filled.send().map_err(|e| ControlError::io("requests", &e))?;
+        loop {
+            if let Some(answer) = pending.receive().map_err(|e| ControlError::io("requests", &e))? {
+                let h = *answer.user_header();
+                if h.magic != REQUEST_MAGIC || h.layout_version != REQUEST_VERSION {
+                    return Err(ControlError::Version { service: "requests", found: h.layout_version, expected: REQUEST_VERSION });
+                }
+                let n = (h.length as usize).min(answer.payload().len());
+                let json = String::from_utf8_lossy(&answer.payload()[..n]).into_owned();
+                return Ok(Answer { accepted: h.status == 0, json });
+            }
+            if Instant::now() >= until {
+                return Err(ControlError::NoDaemon);
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+}
+
+/// One request as the daemon sees it.
+pub struct Request {
+    /// What is asked for.
+    pub verb: Verb,
+    /// When it was made, by the client's word.
+    pub stamp_ns: u64,
+    /// Its payload.
+    pub payload: Vec<u8>,
+    active: ActiveRequest<ipc::Service, [u8], RequestHeader, [u8], AnswerHeader>,
+}
+
+impl std::fmt::Debug for Request {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Request").field("verb", &self.verb).field("bytes", &self.payload.len()).finish_non_exhaustive()
+    }
+}
+
+impl Request {
+    /// Answers, with one JSON object. A client that is gone is not an error.
+    pub fn answer(&self, accepted: bool, json: &str) {
+        respond(&self.active, u32::from(!accepted), json);
+    }
+}
+
+fn respond(active: &ActiveRequest<ipc::Service, [u8], RequestHeader, [u8], AnswerHeader>, status: u32, json: &str) {
+    let bytes = json.as_bytes();
+    let n = bytes.len().min(ANSWER_MAX_BYTES);
+    let Ok(mut loan) = active.loan_slice_uninit(n.max(1)) else { return };
+    *loan.user_header_mut() = AnswerHeader {
+        magic: REQUEST_MAGIC,
+        layout_version: REQUEST_VERSION,
+        status,
+        length: u32::try_from(n).unwrap_or(0),
+    };
+    // The client may have died between asking and our answer; there is nobody left to tell.
+    let _ = loan.write_from_fn(|i| bytes.get(i).copied().unwrap_or(b' ')).send();
+}
+
+/// Receives requests.
+#[derive(Debug)]
+pub struct RequestServer {
+    server: Server<ipc::Service, [u8], RequestHeader, [u8], AnswerHeader>,
+    _service: Factory,
+}
+
+impl RequestServer {
+    /// Opens or creates the service. There is one server in a cell: a second daemon is refused here.
+    ///
+    /// # Errors
+    /// When another daemon serves this cell, or shared memory is refused.
+    pub fn new(node: &ShmNode) -> Result<Self, ControlError> {
+        let service = open(node)?;
+        let server = service
+            .server_builder()
+            .initial_max_slice_len(ANSWER_MAX_BYTES)
+            .create()
+            .map_err(|e| ControlError::open("requests (is a second daemon running in this cell?)", &e))?;
+        Ok(Self { server, _service: service })
+    }
+
+    /// The next well-formed request; malformed ones are answered as such here and never seen.
+    ///
+    /// # Errors
+    /// When shared memory fails underneath.
+    pub fn next(&self) -> Result<Option<Request>, ControlError> {
+        while let Some(active) = self.server.receive().map_err(|e| ControlError::io("requests", &e))? {
+            let h = *active.user_header();
+            let length = h.length as usize;
+            let verb = Verb::from_number(h.verb);
+            let sound = h.magic == REQUEST_MAGIC && h.layout_version == REQUEST_VERSION && length <= active.payload().len();
+            match (sound, verb) {
+                (true, Some(verb)) => {
+                    let payload = active.payload()[..length].to_vec();
+                    return Ok(Some(Request { verb, stamp_ns: h.stamp_ns, payload, active }));
+                }
+                _ => respond(&active, 2, r#"{"accepted":false,"reason":"malformed request: see shm/CONTROL.md"}"#),
+            }
+        }
+        Ok(None)
+    }
+}
