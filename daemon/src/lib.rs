@@ -1,1 +1,10 @@
-//! The wiring of the daemon: configuration, threads, sockets, commands.
+//! The daemon: configuration, threads, sockets and commands. It moves values between boxes and knows no mathematics.
+//!
+//! `graspd run` is the real-time daemon (two real-time threads, [`realtime`] and [`threads`]); every other subcommand is an ordinary
+//! program that shares its files and formats.
+
+pub mod cli;
+pub mod config;
+pub mod exit;
+pub mod realtime;
+pub mod threads;

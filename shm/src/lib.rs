@@ -8,6 +8,7 @@
 //! identities are checked against the sample that really arrived before a pixel is read, and every refusal is a typed,
 //! counted [`frame::Reject`].
 
+pub mod control;
 mod error;
 pub mod frame;
 pub mod names;

@@ -6,8 +6,10 @@ use std::path::PathBuf;
 /// Guides a robot gripper onto a curved part, with two fixed cameras and no knowledge of where they stand.
 #[derive(Debug, Parser)]
 #[command(name = "graspd", version, propagate_version = true, max_term_width = 110)]
-#[command(after_help = "Exit codes: 0 done, 1 not converged or refused, 2 usage, 3 input or configuration, 4 link, 5 fault.\n\
-    Try it without a robot: graspd demo")]
+#[command(
+    after_help = "Exit codes: 0 done, 1 not converged or refused, 2 usage, 3 input or configuration, 4 link, 5 fault.\n\
+    Try it without a robot: graspd demo"
+)]
 pub struct Cli {
     /// What to do.
     #[command(subcommand)]

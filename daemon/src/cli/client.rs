@@ -22,7 +22,10 @@ fn names(args: &ClientArgs) -> Result<Names, Failure> {
 /// No daemon, a refused request, or a file that cannot be read.
 pub fn send(args: &ClientArgs, verb: Verb, payload: &[u8]) -> Result<Exit, Failure> {
     if !(args.timeout.is_finite() && args.timeout > 0.0 && args.timeout <= 3600.0) {
-        return Err(Failure { exit: Exit::Usage, message: format!("--timeout {} is not a number of seconds from 0 to 3600", args.timeout) });
+        return Err(Failure {
+            exit: Exit::Usage,
+            message: format!("--timeout {} is not a number of seconds from 0 to 3600", args.timeout),
+        });
     }
     let node = create_node(&names(args)?, "graspd-client").map_err(|e| Failure::link(e.to_string()))?;
     let client = RequestClient::new(&node).map_err(|e| Failure::link(e.to_string()))?;
@@ -39,7 +42,9 @@ pub fn send(args: &ClientArgs, verb: Verb, payload: &[u8]) -> Result<Exit, Failu
     }
     let reason = serde_json::from_str::<serde_json::Value>(&answer.json).ok();
     let fault = reason.as_ref().and_then(|v| v.get("state")).and_then(|v| v.as_str()) == Some("fault");
-    let text = reason.and_then(|v| v.get("reason").and_then(|r| r.as_str()).map(str::to_owned)).unwrap_or_else(|| "refused".into());
+    let text = reason
+        .and_then(|v| v.get("reason").and_then(|r| r.as_str()).map(str::to_owned))
+        .unwrap_or_else(|| "refused".into());
     Err(Failure { exit: if fault { Exit::Fault } else { Exit::NotConverged }, message: text })
 }
 
@@ -49,7 +54,11 @@ pub fn send(args: &ClientArgs, verb: Verb, payload: &[u8]) -> Result<Exit, Failu
 /// As [`send`], and when the file cannot be read.
 pub fn setpoint(args: &SetpointArgs) -> Result<Exit, Failure> {
     let text = std::fs::read(&args.plan).map_err(|e| {
-        Failure::input(format!("{}: cannot be read ({e}); make a plan with 'graspd plan ... --out {}'", args.plan.display(), args.plan.display()))
+        Failure::input(format!(
+            "{}: cannot be read ({e}); make a plan with 'graspd plan ... --out {}'",
+            args.plan.display(),
+            args.plan.display()
+        ))
     })?;
     send(&args.client, Verb::Setpoint, &text)
 }

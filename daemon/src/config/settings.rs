@@ -65,9 +65,11 @@ impl Config {
     /// Names the file, the key, the value and the fix.
     pub fn load(path: &Path) -> Result<Self, Failure> {
         let shown = path.display();
-        let text = std::fs::read_to_string(path)
-            .map_err(|e| Failure::input(format!("{shown}: cannot be read ({e}); docs/CONFIG.md has an example to start from")))?;
-        let raw: RawConfig = toml::from_str(&text).map_err(|e| Failure::input(format!("{shown}: {e}\nSee docs/CONFIG.md for every key.")))?;
+        let text = std::fs::read_to_string(path).map_err(|e| {
+            Failure::input(format!("{shown}: cannot be read ({e}); docs/CONFIG.md has an example to start from"))
+        })?;
+        let raw: RawConfig = toml::from_str(&text)
+            .map_err(|e| Failure::input(format!("{shown}: {e}\nSee docs/CONFIG.md for every key.")))?;
         check_numbers(path, &raw)?;
         let folder = path.parent().unwrap_or(Path::new("."));
         let names = names(&raw.cell, raw.shm.root.as_deref().map(|r| folder.join(r)).as_deref())
@@ -79,8 +81,9 @@ impl Config {
             "mock" => LinkKind::Mock,
             other => return Err(bad(path, "arm.link", other, "use \"rtde\" or \"mock\"")),
         };
-        let model = Model::from_name(&raw.arm.model)
-            .ok_or_else(|| bad(path, "arm.model", &raw.arm.model, "use ur3, ur5, ur10, ur3e, ur5e, ur10e, ur16e, ur20 or ur30"))?;
+        let model = Model::from_name(&raw.arm.model).ok_or_else(|| {
+            bad(path, "arm.model", &raw.arm.model, "use ur3, ur5, ur10, ur3e, ur5e, ur10e, ur16e, ur20 or ur30")
+        })?;
         let kinematics = match raw.arm.kinematics.as_str() {
             "controller" => Kinematics::Controller,
             "nominal" => Kinematics::Nominal,

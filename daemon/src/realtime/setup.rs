@@ -46,7 +46,9 @@ pub fn enter(name: &str, settings: &ThreadSettings, report: &mut RealtimeReport)
             let mut set = CpuSet::new();
             set.set(core);
             if let Err(e) = sched_setaffinity(None, &set) {
-                report.refused.push(format!("thread {name} could not be pinned to core {core} ({e}); change the core in [loop]"));
+                report
+                    .refused
+                    .push(format!("thread {name} could not be pinned to core {core} ({e}); change the core in [loop]"));
             }
         }
     }

@@ -14,7 +14,7 @@ const BUFFER: usize = 8;
 const SUBSCRIBERS: usize = 16;
 
 fn open(node: &ShmNode) -> Result<PortFactory<ipc::Service, TelemetrySample, ()>, ControlError> {
-    let name = node.service("telemetry");
+    let name = node.names().service("telemetry");
     let parsed = ServiceName::new(&name).map_err(|e| ControlError::open(&name, &e))?;
     node.node()
         .service_builder(&parsed)
@@ -85,7 +85,11 @@ impl TelemetrySubscriber {
             return Ok(None);
         };
         if sample.magic != TELEMETRY_MAGIC || sample.layout_version != TELEMETRY_VERSION {
-            return Err(ControlError::Version { service: "telemetry", found: sample.layout_version, expected: TELEMETRY_VERSION });
+            return Err(ControlError::Version {
+                service: "telemetry",
+                found: sample.layout_version,
+                expected: TELEMETRY_VERSION,
+            });
         }
         Ok(Some(*sample))
     }

@@ -8,6 +8,7 @@ use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::port::client::Client;
 use iceoryx2::port::server::Server;
 use iceoryx2::prelude::*;
+use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::request_response::PortFactory;
 use std::time::{Duration, Instant};
 
@@ -68,7 +69,7 @@ impl ControlError {
 }
 
 fn open(node: &ShmNode) -> Result<Factory, ControlError> {
-    let name = node.service("requests");
+    let name = node.names().service("requests");
     let parsed = ServiceName::new(&name).map_err(|e| ControlError::open(&name, &e))?;
     node.node()
         .service_builder(&parsed)
@@ -130,7 +131,8 @@ impl RequestClient {
             }
             std::thread::sleep(Duration::from_millis(5));
         }
-        let mut loan = self.client.loan_slice_uninit(payload.len().max(1)).map_err(|e| ControlError::io("requests", &e))?;
+        let mut loan =
+            self.client.loan_slice_uninit(payload.len().max(1)).map_err(|e| ControlError::io("requests", &e))?;
         *loan.user_header_mut() = RequestHeader {
             magic: REQUEST_MAGIC,
             layout_version: REQUEST_VERSION,
@@ -144,7 +146,11 @@ impl RequestClient {
             if let Some(answer) = pending.receive().map_err(|e| ControlError::io("requests", &e))? {
                 let h = *answer.user_header();
                 if h.magic != REQUEST_MAGIC || h.layout_version != REQUEST_VERSION {
-                    return Err(ControlError::Version { service: "requests", found: h.layout_version, expected: REQUEST_VERSION });
+                    return Err(ControlError::Version {
+                        service: "requests",
+                        found: h.layout_version,
+                        expected: REQUEST_VERSION,
+                    });
                 }
                 let n = (h.length as usize).min(answer.payload().len());
                 let json = String::from_utf8_lossy(&answer.payload()[..n]).into_owned();
@@ -227,7 +233,8 @@ impl RequestServer {
             let h = *active.user_header();
             let length = h.length as usize;
             let verb = Verb::from_number(h.verb);
-            let sound = h.magic == REQUEST_MAGIC && h.layout_version == REQUEST_VERSION && length <= active.payload().len();
+            let sound =
+                h.magic == REQUEST_MAGIC && h.layout_version == REQUEST_VERSION && length <= active.payload().len();
             match (sound, verb) {
                 (true, Some(verb)) => {
                     let payload = active.payload()[..length].to_vec();

@@ -24,11 +24,13 @@ impl Part {
     /// # Errors
     /// When the program or its log cannot be opened.
     pub fn start(name: &'static str, args: &[String], folder: &Path) -> Result<Self, Failure> {
-        let program = std::env::current_exe()
-            .map_err(|e| Failure::link(format!("this program's own path is unknown ({e}); start graspd by its full path")))?;
+        let program = std::env::current_exe().map_err(|e| {
+            Failure::link(format!("this program's own path is unknown ({e}); start graspd by its full path"))
+        })?;
         let log_path = folder.join(format!("{name}.log"));
-        let log = File::create(&log_path)
-            .map_err(|e| Failure::input(format!("{}: cannot be written ({e}); choose another folder with --out", log_path.display())))?;
+        let log = File::create(&log_path).map_err(|e| {
+            Failure::input(format!("{}: cannot be written ({e}); choose another folder with --out", log_path.display()))
+        })?;
         let mut child = Command::new(program)
             .args(args)
             .stdin(Stdio::piped())
@@ -71,7 +73,11 @@ impl Part {
                     }
                 }
                 Err(RecvTimeoutError::Timeout) => {
-                    return Err(Failure::link(format!("{} said nothing for {:.0} s; see its log", self.name, timeout.as_secs_f64())));
+                    return Err(Failure::link(format!(
+                        "{} said nothing for {:.0} s; see its log",
+                        self.name,
+                        timeout.as_secs_f64()
+                    )));
                 }
                 Err(RecvTimeoutError::Disconnected) => {
                     let how = self.child.wait().map(|s| s.to_string()).unwrap_or_else(|e| e.to_string());
@@ -88,7 +94,9 @@ impl Part {
     pub fn ask(&mut self, line: &str, timeout: Duration) -> Result<serde_json::Value, Failure> {
         while self.lines.try_recv().is_ok() {}
         let pipe = self.stdin.as_mut().ok_or_else(|| Failure::link(format!("{} takes no questions", self.name)))?;
-        writeln!(pipe, "{line}").and_then(|()| pipe.flush()).map_err(|e| Failure::link(format!("{} does not listen ({e})", self.name)))?;
+        writeln!(pipe, "{line}")
+            .and_then(|()| pipe.flush())
+            .map_err(|e| Failure::link(format!("{} does not listen ({e})", self.name)))?;
         self.json_line(timeout)
     }
 
