@@ -1,5 +1,7 @@
 //! A borrowed grey picture.
 
+pub mod convert;
+
 /// One view of a stereo pair: mono8 rows of `stride` bytes, borrowed from wherever the camera put them.
 #[derive(Clone, Copy, Debug)]
 pub struct ImageView<'a> {
@@ -43,5 +45,21 @@ impl<'a> ImageView<'a> {
     #[inline]
     pub fn at(&self, x: usize, y: usize) -> u8 {
         self.row(y).get(x).copied().unwrap_or(0)
+    }
+
+    /// Grey value between pixel centres, bilinear; `None` unless all four neighbours are inside (NaN is outside).
+    #[inline]
+    pub fn sample(&self, x: f64, y: f64) -> Option<f64> {
+        if !(x >= 0.0 && y >= 0.0 && x < (self.width - 1) as f64 && y < (self.height - 1) as f64) {
+            return None;
+        }
+        let (xi, yi) = (x as usize, y as usize);
+        let o = yi * self.stride + xi;
+        let a = self.data.get(o..o + 2)?;
+        let b = self.data.get(o + self.stride..o + self.stride + 2)?;
+        let (fx, fy) = (x - xi as f64, y - yi as f64);
+        let top = f64::from(a[0]) + fx * (f64::from(a[1]) - f64::from(a[0]));
+        let bottom = f64::from(b[0]) + fx * (f64::from(b[1]) - f64::from(b[0]));
+        Some(top + fy * (bottom - top))
     }
 }

@@ -1,10 +1,17 @@
 //! The on-line stage, one file per arrow of the paper: frames in, gripper pose out.
 
+mod content;
+mod frame;
 pub mod interaction;
+pub mod marks;
 pub mod path;
+pub mod pose;
 pub mod predict;
 pub mod rates;
 pub mod screw;
 mod vision;
+mod vision_cycle;
 
+pub use frame::{FrameFaults, FrameLimits, FrameReject, StereoFrame};
 pub use vision::{MarkObservation, Vision, VisionStatus};
+pub use vision_cycle::{VisionCycle, VisionHealth, VisionSettings};

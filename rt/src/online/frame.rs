@@ -1,0 +1,193 @@
+//! One stereo pair as it comes from shared memory, and the reasons for which it is not even looked at.
+
+use crate::geom::{Rig, View};
+use crate::image::ImageView;
+
+/// A stereo pair, borrowed for the time of one step.
+#[derive(Clone, Copy, Debug)]
+pub struct StereoFrame<'a> {
+    /// The left picture.
+    pub left: ImageView<'a>,
+    /// The right picture.
+    pub right: ImageView<'a>,
+    /// The publisher's sequence number.
+    pub sequence: u64,
+    /// When each eye's picture was taken (mid-exposure), CLOCK_MONOTONIC nanoseconds.
+    pub capture_ns: [u64; 2],
+    /// The time now, CLOCK_MONOTONIC nanoseconds.
+    pub now_ns: u64,
+}
+
+impl<'a> StereoFrame<'a> {
+    /// The picture of a view.
+    pub fn image(&self, view: View) -> &ImageView<'a> {
+        match view {
+            View::Left => &self.left,
+            View::Right => &self.right,
+        }
+    }
+}
+
+/// What a stereo pair's stamps may be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FrameLimits {
+    /// Largest time between the two eyes, nanoseconds. Default 5 ms.
+    pub max_skew_ns: u64,
+    /// Oldest capture that is still looked at, nanoseconds. Default 1 s.
+    pub max_age_ns: u64,
+    /// How far a stamp may lie in the future (clock reading order, not clock error), nanoseconds. Default 2 ms.
+    pub max_ahead_ns: u64,
+}
+
+impl Default for FrameLimits {
+    fn default() -> Self {
+        Self { max_skew_ns: 5_000_000, max_age_ns: 1_000_000_000, max_ahead_ns: 2_000_000 }
+    }
+}
+
+/// Why a stereo pair was refused; the fault catalogue's numbers are in brackets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FrameReject {
+    /// A picture has not the size of the rig's camera \[C08\].
+    Size {
+        /// Which view.
+        view: View,
+        /// Width and height found.
+        found: [u32; 2],
+        /// Width and height of the calibration.
+        expected: [u32; 2],
+    },
+    /// The sequence number repeats or goes back \[C04\].
+    Sequence {
+        /// The last accepted number.
+        last: u64,
+        /// The number of this pair.
+        got: u64,
+    },
+    /// A capture stamp is not later than the last accepted one of its eye \[C04, C11\].
+    NotLater {
+        /// Which view.
+        view: View,
+    },
+    /// The eyes are too far apart in time \[C06\].
+    Skew {
+        /// Time between the eyes, nanoseconds.
+        ns: u64,
+    },
+    /// The pair is too old \[C10\].
+    Stale {
+        /// Its age, nanoseconds.
+        ns: u64,
+    },
+    /// A stamp lies in the future \[C10\].
+    Future {
+        /// How far, nanoseconds.
+        ns: u64,
+    },
+    /// The marks were found, farther from the last pose than the gripper can have moved \[M03, M05\].
+    Jump {
+        /// Distance, micrometres.
+        um: u32,
+        /// Turn, milliradians.
+        mrad: u32,
+    },
+}
+
+/// Counts of what was wrong with frames since start; a plain value for telemetry.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct FrameFaults {
+    /// Pairs accepted.
+    pub accepted: u64,
+    /// Pairs that never arrived, by gaps of the sequence number.
+    pub skipped: u64,
+    /// Pairs of a wrong size.
+    pub size: u64,
+    /// Pairs with a repeated or smaller sequence number.
+    pub sequence: u64,
+    /// Pairs whose stamps did not advance.
+    pub not_later: u64,
+    /// Pairs with too much time between the eyes.
+    pub skew: u64,
+    /// Pairs too old on arrival.
+    pub stale: u64,
+    /// Pairs stamped in the future.
+    pub future: u64,
+    /// Poses refused as physically impossible jumps.
+    pub jump: u64,
+    /// Pairs that were black, saturated or without contrast \[C12\].
+    pub exposure: u64,
+    /// Pairs in which the marks were lost.
+    pub lost: u64,
+    /// Joint predictions that contradicted the last pose and were not used.
+    pub prior: u64,
+    /// Mark observations thrown out as inconsistent with the other marks \[M04, M08\].
+    pub outliers: u64,
+    /// Rejects since the last accepted pair.
+    pub in_a_row: u32,
+}
+
+impl FrameFaults {
+    /// Adds one reject.
+    pub(crate) fn count(&mut self, reject: &FrameReject) {
+        let n = match reject {
+            FrameReject::Size { .. } => &mut self.size,
+            FrameReject::Sequence { .. } => &mut self.sequence,
+            FrameReject::NotLater { .. } => &mut self.not_later,
+            FrameReject::Skew { .. } => &mut self.skew,
+            FrameReject::Stale { .. } => &mut self.stale,
+            FrameReject::Future { .. } => &mut self.future,
+            FrameReject::Jump { .. } => &mut self.jump,
+        };
+        *n += 1;
+        self.in_a_row = self.in_a_row.saturating_add(1);
+    }
+}
+
+/// What the last accepted pair was.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct LastFrame {
+    pub(crate) sequence: u64,
+    pub(crate) capture_ns: [u64; 2],
+}
+
+/// Checks a pair's sizes and stamps against the rig, the limits, and the last accepted pair.
+pub(crate) fn check(
+    frame: &StereoFrame<'_>,
+    rig: &Rig,
+    limits: &FrameLimits,
+    last: Option<&LastFrame>,
+) -> Result<(), FrameReject> {
+    for view in View::BOTH {
+        let (image, camera) = (frame.image(view), rig.camera(view));
+        let found = [image.width() as u32, image.height() as u32];
+        let expected = [camera.width, camera.height];
+        if found != expected {
+            return Err(FrameReject::Size { view, found, expected });
+        }
+    }
+    let [l, r] = frame.capture_ns;
+    let ahead = l.max(r).saturating_sub(frame.now_ns);
+    if ahead > limits.max_ahead_ns {
+        return Err(FrameReject::Future { ns: ahead });
+    }
+    let age = frame.now_ns.saturating_sub(l.min(r));
+    if age > limits.max_age_ns {
+        return Err(FrameReject::Stale { ns: age });
+    }
+    let skew = l.abs_diff(r);
+    if skew > limits.max_skew_ns {
+        return Err(FrameReject::Skew { ns: skew });
+    }
+    if let Some(last) = last {
+        if frame.sequence <= last.sequence {
+            return Err(FrameReject::Sequence { last: last.sequence, got: frame.sequence });
+        }
+        for view in View::BOTH {
+            let i = view.index();
+            if frame.capture_ns[i] <= last.capture_ns[i] {
+                return Err(FrameReject::NotLater { view });
+            }
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,289 @@
+//! Gripper pose from the marks of both views, or of one: robust weighted reprojection error, a fixed number of steps.
+//!
+//! The unknown is a small gripper-frame screw `xi = [v; ω]`, `left_from_gripper <- left_from_gripper * exp(xi)`; in that frame the
+//! derivative of a mark's position is the same whatever the pose, and the covariance is what the command side wants.
+
+use super::MarkObservation;
+use crate::geom::{Pixel, Pose, Rig, Twist, Vec3, View, exp_twist};
+use crate::gripper::{Gripper, MAX_MARKS};
+use crate::math;
+use nalgebra::{Matrix2, Matrix2x6, Matrix3x6, Matrix6, Point3, Vector2, Vector6};
+
+/// Marks by view and mark index, as [`super::Vision`] carries them.
+pub type MarkTable = [[Option<MarkObservation>; MAX_MARKS]; 2];
+
+/// How the pose is estimated.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PoseSettings {
+    /// Gauss-Newton steps of the robust stage. Default 10.
+    pub steps: u32,
+    /// A mark farther from its prediction than this many of its sigmas (of the marks' own spread, if that is larger) is dropped.
+    /// Default 5.
+    pub gate_sigmas: f64,
+    /// A mark within this distance of its prediction is never dropped, pixels: a rig whose calibration is slightly wrong moves
+    /// all marks of a view, and none of them is at fault. Default 0.5.
+    pub gate_floor_px: f64,
+}
+
+impl Default for PoseSettings {
+    fn default() -> Self {
+        Self { steps: 10, gate_sigmas: 5.0, gate_floor_px: 0.5 }
+    }
+}
+
+/// Why there is no pose.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PoseError {
+    /// Fewer marks than determine a pose: three in stereo (two of them in both views), four in one view.
+    TooFew,
+    /// The marks do not determine all six degrees of freedom: on a line, or too near to each other.
+    Degenerate,
+    /// The iteration ran behind a camera or out of the numbers.
+    Diverged,
+}
+
+/// A pose and what supports it.
+#[derive(Clone, Copy, Debug)]
+pub struct PoseEstimate {
+    /// Gripper pose in the rig.
+    pub left_from_gripper: Pose,
+    /// Covariance as a small gripper-frame screw (m, rad), scaled up when the marks disagree by more than they claim.
+    pub covariance: Matrix6<f64>,
+    /// Weighted root mean square of the used marks' reprojection error, pixels.
+    pub residual_px: f64,
+    /// Which observations were used; the others were absent or dropped as outliers.
+    pub used: [[bool; MAX_MARKS]; 2],
+}
+
+impl PoseEstimate {
+    /// Number of marks used in a view.
+    pub fn used_in(&self, view: View) -> usize {
+        self.used[view.index()].iter().filter(|u| **u).count()
+    }
+
+    /// Number of marks used in at least one view.
+    pub fn distinct(&self) -> usize {
+        let [l, r] = &self.used;
+        l.iter().zip(r).filter(|(l, r)| **l || **r).count()
+    }
+}
+
+#[derive(Clone, Copy)]
+struct Observation {
+    view: View,
+    mark: usize,
+    point: Vec3,
+    pixel: Pixel,
+    information: Matrix2<f64>,
+    weight: f64,
+}
+
+type Observations = heapless::Vec<Observation, { 2 * MAX_MARKS }>;
+
+/// One observation's error (measured minus predicted, pixels) and the derivative of its prediction by the gripper-frame screw.
+fn linearize(rig: &Rig, pose: &Pose, o: &Observation) -> Option<(Vector2<f64>, Matrix2x6<f64>)> {
+    let view_from_gripper = rig.view_from_left(o.view) * pose;
+    let x = (view_from_gripper * Point3::from(o.point)).coords;
+    let (p, jx) = rig.camera(o.view).project_with_jacobian(&x)?;
+    let m = &o.point;
+    // d(point)/d(xi) = [I, -[m]x] in the gripper frame.
+    let body = Matrix3x6::new(
+        1.0, 0.0, 0.0, 0.0, m.z, -m.y, //
+        0.0, 1.0, 0.0, -m.z, 0.0, m.x, //
+        0.0, 0.0, 1.0, m.y, -m.x, 0.0,
+    );
+    let r = view_from_gripper.rotation.to_rotation_matrix();
+    let e = o.pixel - p;
+    (e.x.is_finite() && e.y.is_finite()).then(|| (e, jx * r.matrix() * body))
+}
+
+/// Estimates the pose from `marks`, starting at `start` (within some tens of pixels and degrees of the truth).
+///
+/// Work is bounded: `settings.steps` robust steps, three plain ones, at most `2 * MAX_MARKS` observations each.
+///
+/// # Errors
+/// [`PoseError`] when the marks do not determine a pose; a result is always finite.
+pub fn estimate(
+    rig: &Rig,
+    gripper: &Gripper,
+    marks: &MarkTable,
+    start: &Pose,
+    settings: &PoseSettings,
+) -> Result<PoseEstimate, PoseError> {
+    let mut all = gather(gripper, marks);
+    enough(&all)?;
+    let mut pose = *start;
+    for step in 0..settings.steps.clamp(1, 30) {
+        reweight(rig, &pose, &mut all, step >= 3, settings)?;
+        let (h, g) = normal_equations(rig, &pose, &all)?;
+        if advance(&mut pose, &h, &g)? && step >= 5 {
+            break;
+        }
+    }
+    // Hard decision on outliers, then plain weighted least squares on what is left, which the covariance describes.
+    let scale = spread(rig, &pose, &all)?;
+    let mut kept = Observations::new();
+    for o in &all {
+        let (e, _) = linearize(rig, &pose, o).ok_or(PoseError::Diverged)?;
+        if !outlying(o, &e, scale, settings) {
+            let _ = kept.push(Observation { weight: 1.0, ..*o });
+        }
+    }
+    enough(&kept)?;
+    for _ in 0..3 {
+        let (h, g) = normal_equations(rig, &pose, &kept)?;
+        if advance(&mut pose, &h, &g)? {
+            break;
+        }
+    }
+    finish(rig, pose, &kept)
+}
+
+fn gather(gripper: &Gripper, marks: &MarkTable) -> Observations {
+    let mut all = Observations::new();
+    for view in View::BOTH {
+        for (mark, (m, seen)) in gripper.marks.iter().zip(&marks[view.index()]).enumerate() {
+            let Some(seen) = seen else { continue };
+            let finite = seen.pixel.iter().chain(seen.covariance.iter()).all(|v| v.is_finite());
+            let positive = seen.covariance[(0, 0)] > 0.0 && seen.covariance.determinant() > 0.0;
+            if let (true, true, Some(information)) = (finite, positive, seen.covariance.try_inverse()) {
+                let o = Observation { view, mark, point: m.position, pixel: seen.pixel, information, weight: 1.0 };
+                let _ = all.push(o);
+            }
+        }
+    }
+    all
+}
+
+fn enough(all: &Observations) -> Result<(), PoseError> {
+    let count = |v: View| all.iter().filter(|o| o.view == v).count();
+    let both = all
+        .iter()
+        .filter(|o| o.view == View::Left && all.iter().any(|r| r.view == View::Right && r.mark == o.mark))
+        .count();
+    let (l, r) = (count(View::Left), count(View::Right));
+    let distinct = l + r - both;
+    if l.max(r) >= 4 || (distinct >= 3 && both >= 2) || (distinct >= 4 && l + r >= 6) {
+        Ok(())
+    } else {
+        Err(PoseError::TooFew)
+    }
+}
+
+/// Whitened length of an error: about 1.2 on the median for an honest covariance.
+fn whitened(o: &Observation, e: &Vector2<f64>) -> f64 {
+    math::sqrt((e.transpose() * o.information * e)[0].max(0.0))
+}
+
+/// Robust scale of the whitened errors, at least 1.
+fn spread(rig: &Rig, pose: &Pose, all: &Observations) -> Result<f64, PoseError> {
+    let mut z: heapless::Vec<f64, { 2 * MAX_MARKS }> = heapless::Vec::new();
+    for o in all {
+        let (e, _) = linearize(rig, pose, o).ok_or(PoseError::Diverged)?;
+        let _ = z.push(whitened(o, &e));
+    }
+    z.sort_unstable_by(f64::total_cmp);
+    // The median length of a two-dimensional unit normal is 1.177.
+    Ok((z.get(z.len() / 2).copied().unwrap_or(0.0) / 1.177).max(1.0))
+}
+
+fn outlying(o: &Observation, e: &Vector2<f64>, scale: f64, settings: &PoseSettings) -> bool {
+    let floor = settings.gate_floor_px;
+    whitened(o, e) > settings.gate_sigmas * scale && e.norm_squared() > floor * floor
+}
+
+/// Weights for the next step: Huber while the pose is still on its way, Tukey when it is nearly there.
+fn reweight(
+    rig: &Rig,
+    pose: &Pose,
+    all: &mut Observations,
+    late: bool,
+    settings: &PoseSettings,
+) -> Result<(), PoseError> {
+    let scale = spread(rig, pose, all)?;
+    for o in all.iter_mut() {
+        let (e, _) = linearize(rig, pose, o).ok_or(PoseError::Diverged)?;
+        let z = whitened(o, &e) / scale;
+        o.weight = if late {
+            let u = 1.0 - math::sq(z / settings.gate_sigmas);
+            // A mark that the gate would keep keeps a say, else a slightly wrong rig could starve the solution.
+            if outlying(o, &e, scale, settings) { 1e-6 } else { math::sq(u.max(0.1)) }
+        } else if z <= 1.5 {
+            1.0
+        } else {
+            1.5 / z
+        };
+    }
+    Ok(())
+}
+
+fn normal_equations(rig: &Rig, pose: &Pose, all: &Observations) -> Result<(Matrix6<f64>, Vector6<f64>), PoseError> {
+    let mut h = Matrix6::zeros();
+    let mut g = Vector6::zeros();
+    for o in all {
+        let (e, j) = linearize(rig, pose, o).ok_or(PoseError::Diverged)?;
+        let jw = j.transpose() * (o.information * o.weight);
+        h += jw * j;
+        g += jw * e;
+    }
+    Ok((h, g))
+}
+
+/// Inverse of a positive definite matrix, `None` when a pivot has lost ten digits or more against its diagonal.
+fn inverse(h: &Matrix6<f64>) -> Option<Matrix6<f64>> {
+    let l = h.cholesky()?;
+    for i in 0..6 {
+        let pivot = math::sq(l.l_dirty()[(i, i)]);
+        if !(pivot > 1e-10 * h[(i, i)]) {
+            return None;
+        }
+    }
+    let inv = l.inverse();
+    inv.iter().all(|v| v.is_finite()).then_some(inv)
+}
+
+/// One damped step, limited in length; true when it was so short that the iteration has ended.
+fn advance(pose: &mut Pose, h: &Matrix6<f64>, g: &Vector6<f64>) -> Result<bool, PoseError> {
+    let mut damped = *h;
+    for i in 0..6 {
+        damped[(i, i)] *= 1.0 + 1e-7;
+    }
+    let mut xi: Twist = inverse(&damped).ok_or(PoseError::Degenerate)? * g;
+    let v = math::sqrt(xi.fixed_rows::<3>(0).norm_squared());
+    let w = math::sqrt(xi.fixed_rows::<3>(3).norm_squared());
+    let longest = (v / 0.2).max(w / 0.4);
+    if !longest.is_finite() {
+        return Err(PoseError::Diverged);
+    }
+    if longest > 1.0 {
+        xi /= longest;
+    }
+    *pose *= exp_twist(&xi);
+    Ok(v < 1e-9 && w < 1e-8)
+}
+
+fn finish(rig: &Rig, mut pose: Pose, kept: &Observations) -> Result<PoseEstimate, PoseError> {
+    pose.rotation.renormalize();
+    let (h, _) = normal_equations(rig, &pose, kept)?;
+    let covariance = inverse(&h).ok_or(PoseError::Degenerate)?;
+    let (mut chi2, mut sum, mut weights) = (0.0, 0.0, 0.0);
+    let mut used = [[false; MAX_MARKS]; 2];
+    for o in kept {
+        let (e, _) = linearize(rig, &pose, o).ok_or(PoseError::Diverged)?;
+        chi2 += (e.transpose() * o.information * e)[0];
+        let w = 0.5 * o.information.trace();
+        sum += w * e.norm_squared();
+        weights += w;
+        if let Some(u) = used[o.view.index()].get_mut(o.mark) {
+            *u = true;
+        }
+    }
+    let freedom = 2.0 * kept.len() as f64 - 6.0;
+    let factor = if freedom > 0.5 { (chi2 / freedom).max(1.0) } else { 1.0 };
+    let residual_px = math::sqrt(sum / weights);
+    let t = &pose.translation.vector;
+    if !(residual_px.is_finite() && t.iter().chain(pose.rotation.coords.iter()).all(|v| v.is_finite())) {
+        return Err(PoseError::Diverged);
+    }
+    Ok(PoseEstimate { left_from_gripper: pose, covariance: covariance * factor, residual_px, used })
+}

@@ -1,0 +1,382 @@
+//! One frame after another into gripper poses: predict, measure, solve, look again where it paid, judge.
+//!
+//! The cycle owns everything that is remembered between frames. It never searches the whole picture: when the marks are lost it
+//! says so, and an acquisition (see [`super::acquire`]) done elsewhere hands its pose to [`VisionCycle::seed`].
+
+use super::content::{FreezeWatch, badly_exposed};
+use super::frame::{self, FrameFaults, FrameLimits, FrameReject, LastFrame, StereoFrame};
+use super::marks::{self, MarkSettings, Outline};
+use super::pose::{self, MarkTable, PoseEstimate, PoseSettings};
+use super::{Vision, VisionStatus};
+use crate::geom::{Pose, Rig, Twist, View, exp_twist, log_pose};
+use crate::gripper::{Gripper, MAX_MARKS};
+use crate::math;
+use nalgebra::Matrix6;
+
+/// How frames are tracked and judged.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VisionSettings {
+    /// What a mark has to look like.
+    pub marks: MarkSettings,
+    /// How the pose is solved.
+    pub pose: PoseSettings,
+    /// What a pair's stamps may be.
+    pub frame: FrameLimits,
+    /// Fastest motion of the gripper's origin that is believed, m/s. Default 1.0, four times the usual Cartesian cap.
+    pub max_speed: f64,
+    /// Fastest turn that is believed, rad/s. Default 4.
+    pub max_turn: f64,
+    /// Distance always allowed between two poses, metres: noise of a poorly seen gripper. Default 0.004.
+    pub jump_margin: f64,
+    /// Largest standard deviation of the gripper's position along any axis, metres; above it the marks count as lost. Default 0.005.
+    pub max_sigma: f64,
+    /// Largest residual of the used marks, pixels; above it this is not the gripper. Default 3.
+    pub max_residual_px: f64,
+    /// Frames over which lost marks are looked for at the prediction before an acquisition is needed. Default 5.
+    pub coast_frames: u32,
+}
+
+impl Default for VisionSettings {
+    fn default() -> Self {
+        Self {
+            marks: MarkSettings::default(),
+            pose: PoseSettings::default(),
+            frame: FrameLimits::default(),
+            max_speed: 1.0,
+            max_turn: 4.0,
+            jump_margin: 0.004,
+            max_sigma: 0.005,
+            max_residual_px: 3.0,
+            coast_frames: 5,
+        }
+    }
+}
+
+/// What the last frame said about the cameras, beside the pose.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct VisionHealth {
+    /// Frames in a row whose mark windows were byte for byte those of the frame before: a frozen picture, if the arm moves \[C03\].
+    pub frozen_run: u32,
+    /// Whether each view is black, saturated or without contrast \[C12\].
+    pub badly_exposed: [bool; 2],
+    /// Marks predicted to be visible in each view.
+    pub expected: [u8; 2],
+    /// Mean over the marks seen in both views of (measured - predicted) row coordinate, left minus right, pixels: away from its usual
+    /// value when a camera was knocked \[C14\]. Zero when no mark was seen in both.
+    pub vertical_disparity_px: f64,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Track {
+    pose: Pose,
+    /// Gripper-frame velocity, used when there is no prediction from the joints.
+    velocity: Twist,
+    /// Capture time of `pose`; `None` straight after a seed.
+    at_ns: Option<u64>,
+    misses: u32,
+}
+
+/// The tracker: rig, gripper, settings, and what it remembers.
+#[derive(Clone, Debug)]
+pub struct VisionCycle {
+    rig: Rig,
+    gripper: Gripper,
+    settings: VisionSettings,
+    track: Option<Track>,
+    last_frame: Option<LastFrame>,
+    freeze: FreezeWatch,
+    faults: FrameFaults,
+    health: VisionHealth,
+}
+
+impl VisionCycle {
+    /// A tracker without a track: it reports [`VisionStatus::Lost`] until it is seeded.
+    pub fn new(rig: Rig, gripper: Gripper, settings: VisionSettings) -> Self {
+        Self {
+            rig,
+            gripper,
+            settings,
+            track: None,
+            last_frame: None,
+            freeze: FreezeWatch::new(),
+            faults: FrameFaults::default(),
+            health: VisionHealth::default(),
+        }
+    }
+
+    /// Takes over an acquired pose (`left_from_gripper`); the next frame is searched about it. A pose that is not finite is ignored.
+    pub fn seed(&mut self, pose: Pose) {
+        if pose.translation.vector.iter().chain(pose.rotation.coords.iter()).all(|v| v.is_finite()) {
+            self.track = Some(Track { pose, velocity: Twist::zeros(), at_ns: None, misses: 0 });
+        }
+    }
+
+    /// Whether the marks have to be acquired (see [`VisionCycle::seed`]) before tracking can go on.
+    pub fn needs_acquisition(&self) -> bool {
+        self.track.is_none()
+    }
+
+    /// Counts of refused and troubled frames.
+    pub fn faults(&self) -> FrameFaults {
+        self.faults
+    }
+
+    /// What the last frame said about the cameras.
+    pub fn health(&self) -> VisionHealth {
+        self.health
+    }
+
+    /// The rig that this tracker believes in.
+    pub fn rig(&self) -> &Rig {
+        &self.rig
+    }
+
+    /// The gripper that this tracker looks for.
+    pub fn gripper(&self) -> &Gripper {
+        &self.gripper
+    }
+
+    /// Forgets track and stamps, as after a camera's restart with a new clock; counters stay.
+    pub fn reset(&mut self) {
+        self.track = None;
+        self.last_frame = None;
+        self.freeze = FreezeWatch::new();
+    }
+
+    /// Tracks one stereo pair.
+    ///
+    /// `prior` is `left_from_gripper` at capture as predicted from the last pose and the joints' motion since; without it the
+    /// track's own velocity is used. It is ignored straight after a seed, and when it contradicts the last pose.
+    ///
+    /// # Errors
+    /// [`FrameReject`] when the pair, or the pose found in it, is not to be believed. The caller publishes nothing then, so that the
+    /// last result ages; a *seen* loss of the marks is no error but a [`Vision`] with status [`VisionStatus::Lost`].
+    pub fn step(&mut self, frame: &StereoFrame<'_>, prior: Option<Pose>) -> Result<Vision, FrameReject> {
+        if let Err(reject) = frame::check(frame, &self.rig, &self.settings.frame, self.last_frame.as_ref()) {
+            self.faults.count(&reject);
+            return Err(reject);
+        }
+        self.accept(frame);
+        let Some(track) = self.track else { return Ok(self.lost(frame)) };
+        let (start, range) = self.predict(&track, frame, prior);
+        let mut table: MarkTable = [[None; MAX_MARKS]; 2];
+        self.measure(frame, &start, range, &mut table);
+        let Some(estimate) = self.solve(frame, &start, &mut table) else {
+            return Ok(self.miss(frame, track));
+        };
+        if let Err(reject) = self.jump(&track, frame, &estimate) {
+            self.faults.count(&reject);
+            // A jump is first refused, then, if the marks stay where they cannot be, the track is given up.
+            let misses = track.misses + 1;
+            self.track = (misses <= 2).then_some(Track { misses, ..track });
+            return Err(reject);
+        }
+        Ok(self.publish(frame, &track, &estimate, table))
+    }
+
+    fn accept(&mut self, frame: &StereoFrame<'_>) {
+        if let Some(last) = &self.last_frame {
+            self.faults.skipped += frame.sequence - last.sequence - 1;
+        }
+        self.last_frame = Some(LastFrame { sequence: frame.sequence, capture_ns: frame.capture_ns });
+        self.faults.accepted += 1;
+        self.health = VisionHealth::default();
+        for view in View::BOTH {
+            let bad = badly_exposed(frame.image(view), self.settings.marks.min_contrast);
+            self.health.badly_exposed[view.index()] = bad;
+        }
+        if self.health.badly_exposed.contains(&true) {
+            self.faults.exposure += 1;
+        }
+    }
+
+    /// Pose to start from, and how far about it to search (pixels).
+    fn predict(&mut self, track: &Track, frame: &StereoFrame<'_>, prior: Option<Pose>) -> (Pose, f64) {
+        let search = self.settings.marks.search_px;
+        let Some(at) = track.at_ns else { return (track.pose, 1.5 * search) };
+        let dt = seconds(at, stamp(frame));
+        let widen = 1.0 + 0.5 * f64::from(track.misses.min(4));
+        if let Some(prior) = prior {
+            if self.reachable(&track.pose, &prior, dt).is_ok() {
+                return (prior, search * widen);
+            }
+            self.faults.prior += 1;
+        }
+        // Beyond a fifth of a second a constant velocity says nothing any more.
+        (track.pose * exp_twist(&(track.velocity * dt.min(0.2))), search * widen)
+    }
+
+    /// Measures every mark that `pose` puts before a camera and that `table` does not hold yet.
+    fn measure(&self, frame: &StereoFrame<'_>, pose: &Pose, range: f64, table: &mut MarkTable) {
+        for view in View::BOTH {
+            for (mark, slot) in self.gripper.marks.iter().zip(table[view.index()].iter_mut()) {
+                if slot.is_none()
+                    && let Some(outline) = self.outline(view, pose, mark)
+                {
+                    *slot = marks::measure(frame.image(view), &outline, mark, &self.settings.marks, range).ok();
+                }
+            }
+        }
+    }
+
+    fn outline(&self, view: View, pose: &Pose, mark: &crate::gripper::Mark) -> Option<Outline> {
+        let camera_from_gripper = self.rig.view_from_left(view) * pose;
+        marks::predict(self.rig.camera(view), &camera_from_gripper, mark, self.settings.marks.min_facing)
+    }
+
+    /// Solves, looks once more about the solution for marks that were missing or thrown out, and solves again.
+    fn solve(&mut self, frame: &StereoFrame<'_>, start: &Pose, table: &mut MarkTable) -> Option<PoseEstimate> {
+        let mut best = pose::estimate(&self.rig, &self.gripper, table, start, &self.settings.pose).ok()?;
+        let before = keep_used(table, &best);
+        let narrow = (2.0 + 2.0 * best.residual_px).min(self.settings.marks.search_px);
+        let had = count(table);
+        self.measure(frame, &best.left_from_gripper, narrow, table);
+        if count(table) > had {
+            let again = best.left_from_gripper;
+            best = pose::estimate(&self.rig, &self.gripper, table, &again, &self.settings.pose).ok()?;
+            keep_used(table, &best);
+        }
+        self.faults.outliers += before;
+        let worst = (0..3).map(|i| best.covariance[(i, i)]).fold(0.0, f64::max);
+        let s = &self.settings;
+        (worst <= s.max_sigma * s.max_sigma && best.residual_px <= s.max_residual_px).then_some(best)
+    }
+
+    /// Whether a gripper can get from `a` to `b` in `dt` seconds; else how far it is.
+    fn reachable(&self, a: &Pose, b: &Pose, dt: f64) -> Result<(), FrameReject> {
+        let s = &self.settings;
+        let xi = log_pose(&(a.inverse() * b));
+        // The origin's own displacement, not the screw's: a turn about a far axis is a long way for the origin.
+        let moved = math::sqrt((b.translation.vector - a.translation.vector).norm_squared());
+        let turned = math::sqrt(xi.fixed_rows::<3>(3).norm_squared());
+        if moved <= s.max_speed * dt + s.jump_margin && turned <= s.max_turn * dt + 10.0 * s.jump_margin {
+            return Ok(());
+        }
+        Err(FrameReject::Jump { um: (moved * 1e6) as u32, mrad: (turned * 1e3) as u32 })
+    }
+
+    fn jump(&self, track: &Track, frame: &StereoFrame<'_>, estimate: &PoseEstimate) -> Result<(), FrameReject> {
+        let Some(at) = track.at_ns else { return Ok(()) };
+        self.reachable(&track.pose, &estimate.left_from_gripper, seconds(at, stamp(frame)))
+    }
+
+    fn publish(&mut self, frame: &StereoFrame<'_>, track: &Track, e: &PoseEstimate, table: MarkTable) -> Vision {
+        let now = stamp(frame);
+        let velocity = match track.at_ns {
+            Some(at) if now > at => {
+                let dt = seconds(at, now);
+                let latest = log_pose(&(track.pose.inverse() * e.left_from_gripper)) / dt;
+                (track.velocity + latest) * 0.5
+            }
+            _ => Twist::zeros(),
+        };
+        self.track = Some(Track { pose: e.left_from_gripper, velocity, at_ns: Some(now), misses: 0 });
+        self.faults.in_a_row = 0;
+        self.freeze.update(frame, &table);
+        self.health.frozen_run = self.freeze.run();
+        self.health.vertical_disparity_px = self.vertical_disparity(e, &table);
+        let status = self.judge(e, &velocity);
+        Vision {
+            sequence: frame.sequence,
+            capture_ns: frame.capture_ns,
+            status,
+            marks: table,
+            seen: View::BOTH.map(|v| e.used_in(v) as u8),
+            left_from_gripper: e.left_from_gripper,
+            covariance: e.covariance,
+            residual_px: e.residual_px,
+        }
+    }
+
+    /// Full speed needs, in each view, four marks that will still be in the picture three frames on, and half of those that face it.
+    fn judge(&mut self, e: &PoseEstimate, velocity: &Twist) -> VisionStatus {
+        let soon = e.left_from_gripper * exp_twist(&(velocity * 0.1));
+        let mut full = true;
+        for view in View::BOTH {
+            let (mut expected, mut solid) = (0_u8, 0_u8);
+            for (i, mark) in self.gripper.marks.iter().enumerate() {
+                let camera = self.rig.camera(view);
+                let used = e.used[view.index()].get(i).copied().unwrap_or(false);
+                let inside = |pose: &Pose| {
+                    self.outline(view, pose, mark).is_some_and(|o| {
+                        camera.contains(o.centre, o.major + 2.0) && o.minor >= self.settings.marks.min_minor_px
+                    })
+                };
+                let visible = inside(&e.left_from_gripper);
+                expected += u8::from(visible || used);
+                solid += u8::from(used && visible && inside(&soon));
+            }
+            self.health.expected[view.index()] = expected;
+            full &= solid >= 4 && 2 * solid >= expected;
+        }
+        if full { VisionStatus::Tracking } else { VisionStatus::Degraded }
+    }
+
+    fn vertical_disparity(&self, e: &PoseEstimate, table: &MarkTable) -> f64 {
+        let (mut sum, mut n) = (0.0, 0.0);
+        let [left, right] = table;
+        for ((mark, l), r) in self.gripper.marks.iter().zip(left).zip(right) {
+            let (Some(l), Some(r)) = (l, r) else { continue };
+            let x = (e.left_from_gripper * nalgebra::Point3::from(mark.position)).coords;
+            if let (Some(pl), Some(pr)) = (self.rig.project(View::Left, &x), self.rig.project(View::Right, &x)) {
+                sum += (l.pixel.y - pl.y) - (r.pixel.y - pr.y);
+                n += 1.0;
+            }
+        }
+        if n > 0.0 { sum / n } else { 0.0 }
+    }
+
+    fn miss(&mut self, frame: &StereoFrame<'_>, track: Track) -> Vision {
+        let misses = track.misses + 1;
+        // A seed that does not hold is wrong at once; a track gets a few frames to come back from behind something.
+        let keep = track.at_ns.is_some() && misses <= self.settings.coast_frames;
+        self.track = keep.then_some(Track { misses, ..track });
+        let mut v = self.lost(frame);
+        v.left_from_gripper = track.pose;
+        v
+    }
+
+    fn lost(&mut self, frame: &StereoFrame<'_>) -> Vision {
+        self.faults.lost += 1;
+        self.faults.in_a_row = 0;
+        Vision {
+            sequence: frame.sequence,
+            capture_ns: frame.capture_ns,
+            status: VisionStatus::Lost,
+            marks: [[None; MAX_MARKS]; 2],
+            seen: [0; 2],
+            left_from_gripper: Pose::identity(),
+            // Finite, so that arithmetic on it stays finite, and so large that nobody can mistake it for knowledge.
+            covariance: Matrix6::identity() * 1e6,
+            residual_px: 0.0,
+        }
+    }
+}
+
+/// Mid-time of a pair.
+fn stamp(frame: &StereoFrame<'_>) -> u64 {
+    let [l, r] = frame.capture_ns;
+    l.min(r) + l.abs_diff(r) / 2
+}
+
+fn seconds(from: u64, to: u64) -> f64 {
+    to.saturating_sub(from) as f64 * 1e-9
+}
+
+fn count(table: &MarkTable) -> usize {
+    table.iter().flatten().flatten().count()
+}
+
+/// Removes observations that the estimate threw out; says how many.
+fn keep_used(table: &mut MarkTable, e: &PoseEstimate) -> u64 {
+    let mut dropped = 0;
+    for (marks, used) in table.iter_mut().zip(&e.used) {
+        for (m, used) in marks.iter_mut().zip(used) {
+            if m.is_some() && !used {
+                *m = None;
+                dropped += 1;
+            }
+        }
+    }
+    dropped
+}
