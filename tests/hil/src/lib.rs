@@ -1,3 +1,4 @@
 //! The simulated world.
 
 pub mod plant;
+pub mod urscript;

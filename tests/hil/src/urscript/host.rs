@@ -1,0 +1,312 @@
+//! The controller around a script: everything that a program can see or move outside itself.
+//!
+//! A host owns the dynamics, the registers and the wires. The interpreter checks argument counts, types and finiteness before it
+//! calls; a host judges ranges and states and refuses by [`HostError`], which stops the program with the line of the call.
+//! Functions that block a script are polled: the interpreter asks again in each later control step.
+
+use super::error::{HostError, RuntimeError};
+use super::value::Value;
+
+/// Joints of the arm.
+pub const JOINTS: usize = 6;
+/// Joint values, base to wrist 3: rad, rad/s or Nm.
+pub type JointVector = [f64; JOINTS];
+/// Position in metres and rotation vector in radians (or a twist, or a wrench), robot base frame unless said otherwise.
+pub type PoseVector = [f64; 6];
+
+/// Where a Cartesian or joint move goes. A joint target of a linear move is turned into a pose by the host's forward kinematics,
+/// a pose target of `movej` into joints by its inverse kinematics.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Target {
+    /// Joint positions, rad.
+    Joints(JointVector),
+    /// TCP pose in the base frame.
+    Pose(PoseVector),
+}
+
+/// A motion call with its defaults filled in; every number is finite. `t` of 0 means "not given".
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[expect(missing_docs, reason = "the fields are UR's own argument names: a, v, t, r in SI units")]
+pub enum Motion {
+    /// Linear in joint space; blocks until reached (or until the blend of radius `r` begins).
+    MoveJ { target: Target, a: f64, v: f64, t: f64, r: f64 },
+    /// Straight line of the TCP; blocks as `MoveJ`.
+    MoveL { target: Target, a: f64, v: f64, t: f64, r: f64 },
+    /// Process move: constant tool speed, circular blends.
+    MoveP { target: Target, a: f64, v: f64, r: f64 },
+    /// Circle through `via` to `to`; `mode` 0 free orientation, 1 fixed.
+    MoveC { via: Target, to: Target, a: f64, v: f64, r: f64, mode: i32 },
+    /// Joint servo for `t` seconds; `a` and `v` are not used by the controller.
+    ServoJ { q: JointVector, a: f64, v: f64, t: f64, lookahead_time: f64, gain: f64 },
+    /// Circular servo to a pose.
+    ServoC { target: Target, a: f64, v: f64, r: f64 },
+    /// Joint speeds; the arm KEEPS MOVING after the call has returned, until another motion call, a stop or the program's end.
+    /// With `t` > 0 it returns after `t`, without on reaching the speed.
+    SpeedJ { qd: JointVector, a: f64, t: f64 },
+    /// Tool twist in the base frame; `a_rot` 0 means as `a`. Goes on as `SpeedJ`.
+    SpeedL { xd: PoseVector, a: f64, t: f64, a_rot: f64 },
+    /// Decelerate to rest in joint space, rad/s^2 of the leading axis.
+    StopJ { a: f64 },
+    /// Decelerate to rest in tool space, m/s^2; `a_rot` 0 means not given.
+    StopL { a: f64, a_rot: f64 },
+}
+
+/// Progress of the motion that was started last.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum MotionStatus {
+    /// The calling thread stays blocked.
+    Running,
+    /// The call returns in this step.
+    Done,
+    /// The call fails (path not possible, singular, out of reach): runtime exception.
+    Failed(String),
+}
+
+/// `action` of `rtde_set_watchdog`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+pub enum WatchdogAction {
+    /// Pause the program (UR's default).
+    #[default]
+    Pause,
+    /// Stop the program.
+    Stop,
+    /// Do nothing.
+    Ignore,
+}
+
+/// Which general-purpose registers are meant.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Bank {
+    /// `input_*_register`: written by RTDE clients and fieldbus.
+    Input,
+    /// `output_*_register`: written by the script.
+    Output,
+}
+
+/// Which digital or analog signal is meant.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum OutputKind {
+    /// Standard digital or analog, 0..8 or 0..2.
+    Standard,
+    /// Configurable digital, 0..8.
+    Configurable,
+    /// Tool digital or analog, 0..2.
+    Tool,
+}
+
+/// What a script can ask about the arm; all of one control step.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct RobotView {
+    /// Measured joint positions, rad.
+    pub q_actual: JointVector,
+    /// Measured joint speeds, rad/s.
+    pub qd_actual: JointVector,
+    /// Target joint positions, rad.
+    pub q_target: JointVector,
+    /// Target joint speeds, rad/s.
+    pub qd_target: JointVector,
+    /// Joint torques, Nm.
+    pub torques: JointVector,
+    /// Measured TCP pose.
+    pub tcp_pose_actual: PoseVector,
+    /// Target TCP pose.
+    pub tcp_pose_target: PoseVector,
+    /// Measured TCP twist.
+    pub tcp_speed_actual: PoseVector,
+    /// Target TCP twist.
+    pub tcp_speed_target: PoseVector,
+    /// Wrench at the TCP.
+    pub tcp_force: PoseVector,
+    /// Active TCP in the flange frame.
+    pub tcp_offset: PoseVector,
+    /// Payload, kg.
+    pub payload_mass: f64,
+    /// Payload's centre of gravity in the flange frame, m.
+    pub payload_cog: [f64; 3],
+    /// At rest, ready for force mode: `is_steady()`.
+    pub steady: bool,
+    /// Speed slider times scaling, 0 to 1.
+    pub speed_fraction: f64,
+}
+
+/// A question of kinematics.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct KinematicsQuery {
+    /// TCP pose asked for.
+    pub pose: PoseVector,
+    /// Solution nearest to these joints; the current target joints where `None`.
+    pub near: Option<JointVector>,
+    /// Allowed position error, m.
+    pub max_position_error: f64,
+    /// Allowed orientation error, rad.
+    pub max_orientation_error: f64,
+    /// TCP in the flange frame; the active one where `None`.
+    pub tcp: Option<PoseVector>,
+}
+
+/// A window on the pendant.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Popup {
+    /// Text.
+    pub text: String,
+    /// Title, "Popup" by default.
+    pub title: String,
+    /// Shown as a warning.
+    pub warning: bool,
+    /// Shown as an error.
+    pub error: bool,
+    /// The calling thread waits until [`Host::popup_open`] is false.
+    pub blocking: bool,
+}
+
+/// A connection being made.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Connect {
+    /// Not yet; ask again in the next step.
+    Pending,
+    /// Open.
+    Open,
+    /// Refused or out of reach.
+    Failed,
+}
+
+/// Bytes that have arrived on a socket.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Received {
+    /// Some bytes, at least one.
+    Bytes(Vec<u8>),
+    /// None at present.
+    Nothing,
+    /// The peer has closed, or there is no such socket.
+    Closed,
+}
+
+/// What one control step of a program came to.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum StepOutcome {
+    /// Goes on in the next step.
+    Running,
+    /// The main program has returned, or `halt` was executed. Its threads are gone.
+    Finished,
+    /// Stopped by a runtime exception.
+    Failed(RuntimeError),
+}
+
+/// The controller as a script sees it. Required methods are what motion control needs; the rest has defaults that are honest
+/// about not being there.
+pub trait Host {
+    /// Control step in seconds: 0.002 (e-Series) or 0.008 (CB3).
+    fn step_time(&self) -> f64;
+
+    /// Arm state of this step.
+    fn view(&self) -> RobotView;
+
+    /// Integer register, index 0..48 (checked by the caller).
+    fn integer_register(&self, bank: Bank, index: usize) -> i32;
+    /// Float register, index 0..48 (checked by the caller).
+    fn float_register(&self, bank: Bank, index: usize) -> f64;
+    /// Boolean register, index 0..128 (checked by the caller).
+    fn bool_register(&self, bank: Bank, index: usize) -> bool;
+    /// Sets an output integer register, index 0..48.
+    fn write_integer(&mut self, index: usize, value: i32);
+    /// Sets an output float register, index 0..48.
+    fn write_float(&mut self, index: usize, value: f64);
+    /// Sets an output boolean register, index 0..128.
+    fn write_bool(&mut self, index: usize, value: bool);
+
+    /// Begins a motion, replacing any motion that goes on.
+    ///
+    /// # Errors
+    /// The call is refused: runtime exception at the caller's line.
+    fn motion_start(&mut self, motion: &Motion) -> Result<(), HostError>;
+    /// Asked once in each later step while a thread waits for the motion it started.
+    fn motion_poll(&mut self) -> MotionStatus;
+    /// The waiting thread was killed or the program ended with the motion under way: nobody polls it any more. Moves come to a
+    /// stop by themselves; speed motions go on until the next motion call (the host stops them when the program ends).
+    fn motion_abandon(&mut self);
+
+    /// TCP pose at joint positions `q`; `tcp` is the tool in the flange frame, the active one where `None`.
+    fn forward_kinematics(&self, q: &JointVector, tcp: Option<&PoseVector>) -> PoseVector;
+    /// Joint positions for a TCP pose; `None` where there is no solution.
+    fn inverse_kinematics(&self, query: &KinematicsQuery) -> Option<JointVector>;
+    /// Geometric Jacobian at `q` (base frame, TCP point), rows vx vy vz wx wy wz.
+    fn jacobian(&self, q: &JointVector, tcp: Option<&PoseVector>) -> [[f64; 6]; 6];
+
+    /// Text for the pendant's log (text message on the primary interface).
+    fn text_message(&mut self, text: &str);
+    /// Opens a popup.
+    fn popup(&mut self, popup: &Popup) {
+        self.text_message(&popup.text);
+    }
+    /// Whether a popup is open; blocking popups wait for false.
+    fn popup_open(&self) -> bool {
+        false
+    }
+    /// Closes a popup.
+    fn close_popup(&mut self) {}
+
+    /// Stops the program (or pauses it) unless input `name` is written at `min_frequency` Hz.
+    ///
+    /// # Errors
+    /// Unknown input name or frequency out of range.
+    fn set_watchdog(&mut self, name: &str, min_frequency: f64, action: WatchdogAction) -> Result<(), HostError>;
+    /// Stops the arm as a safety event.
+    fn protective_stop(&mut self);
+
+    /// Active TCP in the flange frame.
+    fn set_tcp(&mut self, tcp: &PoseVector);
+    /// Payload in kg and its centre of gravity in m (`None` keeps the present one).
+    ///
+    /// # Errors
+    /// Mass out of range.
+    fn set_payload(&mut self, mass: f64, cog: Option<[f64; 3]>) -> Result<(), HostError>;
+
+    /// Digital input.
+    fn digital_in(&self, kind: OutputKind, index: usize) -> bool;
+    /// Digital output as set.
+    fn digital_out(&self, kind: OutputKind, index: usize) -> bool;
+    /// Sets a digital output.
+    fn set_digital_out(&mut self, kind: OutputKind, index: usize, value: bool);
+    /// Analog input, V or A by its domain.
+    fn analog_in(&self, kind: OutputKind, index: usize) -> f64;
+    /// Sets a standard analog output, 0 to 1 of its range.
+    fn set_analog_out(&mut self, index: usize, value: f64);
+
+    /// Opens connection `name`; called again with the same arguments in later steps while `Pending`. Never blocks.
+    fn socket_connect(&mut self, name: &str, address: &str, port: u16) -> Connect {
+        let _ = (name, address, port);
+        Connect::Failed
+    }
+    /// Closes connection `name`; unknown names are ignored.
+    fn socket_close(&mut self, name: &str) {
+        let _ = name;
+    }
+    /// Sends all bytes, or closes the connection and says false. Never blocks.
+    fn socket_send(&mut self, name: &str, bytes: &[u8]) -> bool {
+        let _ = (name, bytes);
+        false
+    }
+    /// Bytes that have arrived since the last call. Never blocks.
+    fn socket_receive(&mut self, name: &str) -> Received {
+        let _ = name;
+        Received::Closed
+    }
+
+    /// Settings that the interpreter accepts without meaning of its own (`force_mode`, `zero_ftsensor`, `set_gravity`,
+    /// `freedrive_mode`, ...), with their arguments in order: to be recorded, or refused in a state that does not allow them.
+    ///
+    /// # Errors
+    /// Refused in this state.
+    fn setting(&mut self, name: &str, arguments: &[Value]) -> Result<(), HostError> {
+        let _ = (name, arguments);
+        Ok(())
+    }
+    /// Any function that the interpreter does not know: return its value, or `UnknownFunction` as by default.
+    ///
+    /// # Errors
+    /// Unknown to this host too, or refused.
+    fn call(&mut self, name: &str, arguments: &[Value]) -> Result<Value, HostError> {
+        let _ = arguments;
+        Err(HostError::UnknownFunction(name.to_owned()))
+    }
+}
