@@ -13,4 +13,5 @@ pub mod guard;
 pub mod image;
 pub mod math;
 pub mod online;
+pub mod rtde;
 pub mod setpoint;
