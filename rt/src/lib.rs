@@ -12,6 +12,7 @@ pub mod gripper;
 pub mod guard;
 pub mod image;
 pub mod math;
+pub mod mode;
 pub mod online;
 pub mod rtde;
 pub mod setpoint;

@@ -75,10 +75,10 @@ impl Leg {
     /// The reference pose at `s` (0 to 1).
     pub fn pose(&self, s: f64) -> Pose {
         match self {
+            Leg::Line { to, .. } if s >= 1.0 => *to,
             Leg::Line { from, to, turn } => {
                 let p = from.translation.vector + (to.translation.vector - from.translation.vector) * s;
-                let r = if s >= 1.0 { to.rotation } else { from.rotation * rotation(&(turn * s)) };
-                Pose::from_parts(Translation3::from(p), r)
+                Pose::from_parts(Translation3::from(p), from.rotation * rotation(&(turn * s)))
             }
             Leg::Arc { from, centre, axis, angle } => {
                 let (sn, cs) = math::sin_cos(0.5 * angle * s);

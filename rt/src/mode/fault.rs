@@ -1,0 +1,376 @@
+//! What stops the loop, with its evidence and a stable code.
+
+use core::fmt;
+
+/// Why the loop stopped and latched: each needs its cause gone and an operator's reset.
+///
+/// The codes are stable: logs, console and manual use them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum FaultCause {
+    /// F-CAM-01: no usable stereo pair for too long.
+    FramesStale {
+        /// Age of the newest result's picture, ns.
+        age_ns: u64,
+        /// Greatest allowed age, ns.
+        limit_ns: u64,
+    },
+    /// F-CAM-02: stamps from the future, or far in the past.
+    FrameStamps {
+        /// Results refused in a row.
+        count: u32,
+    },
+    /// F-MRK-01: the marks jumped further than the arm can move.
+    MarksJumped {
+        /// Length of the jump, metres (unit-scaled).
+        jump_m: f64,
+        /// Greatest possible, metres.
+        limit_m: f64,
+    },
+    /// F-MRK-02: the pictures and the joints disagree about the motion (frozen picture, wrong camera, slipping mount).
+    MotionMismatch {
+        /// Motion by the joints over the window, metres (unit-scaled).
+        joints_m: f64,
+        /// Disagreement, metres (unit-scaled).
+        difference_m: f64,
+    },
+    /// F-LAW-01: the gripper does not go where it is sent: a sign, frame or mounting is wrong.
+    WrongWay {
+        /// Share of the intended motion that was seen; 1 is right, -1 the opposite.
+        agreement: f64,
+        /// Motion since the start, metres (unit-scaled).
+        moved_m: f64,
+    },
+    /// F-LAW-02: the law's own numbers are not finite, or were far above its caps for long.
+    LawBroken {
+        /// Beats with such numbers in the last second.
+        beats: u32,
+    },
+    /// F-ARM-01: the link to the robot is lost.
+    LinkLost,
+    /// F-ARM-02: robot state is too old.
+    StateStale {
+        /// Age, ns.
+        age_ns: u64,
+        /// Greatest allowed age, ns.
+        limit_ns: u64,
+    },
+    /// F-ARM-03: our set-points do not arrive: the beat echoed by the control script stands still.
+    EchoStopped {
+        /// How long, ns.
+        for_ns: u64,
+    },
+    /// F-ARM-04: set-points cannot be sent.
+    SendBlocked {
+        /// Attempts in a row.
+        count: u32,
+    },
+    /// F-ARM-05: protective stop.
+    ProtectiveStop,
+    /// F-ARM-06: emergency stop.
+    EmergencyStop,
+    /// F-ARM-07: safeguard stop.
+    SafeguardStop,
+    /// F-ARM-08: the controller reports a safety violation or fault.
+    SafetyFault {
+        /// `safety_status_bits`.
+        bits: u32,
+    },
+    /// F-ARM-09: the robot is not in mode running.
+    NotRunning {
+        /// `robot_mode`.
+        mode: i32,
+    },
+    /// F-ARM-10: the control script was paused or stopped.
+    ProgramStopped {
+        /// `runtime_state`.
+        runtime_state: u32,
+    },
+    /// F-ARM-11: the control script reported a fault of its own.
+    ScriptFault {
+        /// Its fault word.
+        word: i32,
+    },
+    /// F-ARM-12: another program commands the robot.
+    TokenChanged {
+        /// Our session's token.
+        expected: i32,
+        /// What was echoed.
+        found: i32,
+    },
+    /// F-ARM-13: the controller's clock went back: it restarted.
+    ClockBack {
+        /// Seconds it went back by.
+        by_s: f64,
+    },
+    /// F-ARM-14: the arm does not follow its set-points.
+    TrackingError {
+        /// The worst joint, 0 to 5.
+        joint: u8,
+        /// Its velocity error, rad/s.
+        velocity: f64,
+        /// Its position error, rad.
+        position: f64,
+    },
+    /// F-ARM-15: the arm moves without being told to.
+    Uncommanded {
+        /// The fastest joint, 0 to 5.
+        joint: u8,
+        /// Its velocity, rad/s.
+        velocity: f64,
+    },
+    /// F-ARM-16: a robot value is not a number, out of range, or jumped.
+    StateAbsurd {
+        /// The joint, 0 to 5; 6 where it is no joint's value.
+        joint: u8,
+        /// The value.
+        value: f64,
+    },
+    /// F-TIM-01: the loop was not run for too long.
+    Stalled {
+        /// How long, ns.
+        for_ns: u64,
+    },
+    /// F-TIM-02: time went backwards.
+    TimeBack,
+    /// F-INT-01: a thread of the daemon ended or a defect was caught.
+    Internal,
+}
+
+impl FaultCause {
+    /// The stable code.
+    pub const fn code(&self) -> &'static str {
+        match self {
+            FaultCause::FramesStale { .. } => "F-CAM-01",
+            FaultCause::FrameStamps { .. } => "F-CAM-02",
+            FaultCause::MarksJumped { .. } => "F-MRK-01",
+            FaultCause::MotionMismatch { .. } => "F-MRK-02",
+            FaultCause::WrongWay { .. } => "F-LAW-01",
+            FaultCause::LawBroken { .. } => "F-LAW-02",
+            FaultCause::LinkLost => "F-ARM-01",
+            FaultCause::StateStale { .. } => "F-ARM-02",
+            FaultCause::EchoStopped { .. } => "F-ARM-03",
+            FaultCause::SendBlocked { .. } => "F-ARM-04",
+            FaultCause::ProtectiveStop => "F-ARM-05",
+            FaultCause::EmergencyStop => "F-ARM-06",
+            FaultCause::SafeguardStop => "F-ARM-07",
+            FaultCause::SafetyFault { .. } => "F-ARM-08",
+            FaultCause::NotRunning { .. } => "F-ARM-09",
+            FaultCause::ProgramStopped { .. } => "F-ARM-10",
+            FaultCause::ScriptFault { .. } => "F-ARM-11",
+            FaultCause::TokenChanged { .. } => "F-ARM-12",
+            FaultCause::ClockBack { .. } => "F-ARM-13",
+            FaultCause::TrackingError { .. } => "F-ARM-14",
+            FaultCause::Uncommanded { .. } => "F-ARM-15",
+            FaultCause::StateAbsurd { .. } => "F-ARM-16",
+            FaultCause::Stalled { .. } => "F-TIM-01",
+            FaultCause::TimeBack => "F-TIM-02",
+            FaultCause::Internal => "F-INT-01",
+        }
+    }
+}
+
+/// In words, with the figures, and what to do. Formatting happens outside the loop.
+impl fmt::Display for FaultCause {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let ms = |ns: &u64| *ns as f64 * 1e-6;
+        match self {
+            FaultCause::FramesStale { age_ns, limit_ns } => write!(
+                f,
+                "the newest usable picture is {:.0} ms old (limit {:.0} ms): check the cameras",
+                ms(age_ns),
+                ms(limit_ns)
+            ),
+            FaultCause::FrameStamps { count } => {
+                write!(f, "{count} pictures in a row with impossible time stamps: check the camera driver's clock")
+            }
+            FaultCause::MarksJumped { jump_m, limit_m } => write!(
+                f,
+                "the marks jumped by {:.1} mm, more than the arm can move ({:.1} mm)",
+                jump_m * 1e3,
+                limit_m * 1e3
+            ),
+            FaultCause::MotionMismatch { joints_m, difference_m } => write!(
+                f,
+                "the arm moved by {:.1} mm and the pictures disagree by {:.1} mm: a picture stands still, or the gripper's mounting is wrong",
+                joints_m * 1e3,
+                difference_m * 1e3
+            ),
+            FaultCause::WrongWay { agreement, moved_m } => write!(
+                f,
+                "the gripper does not go where it is sent (agreement {agreement:.2} after {:.1} mm): check flange_from_gripper, the arm's model and the marks",
+                moved_m * 1e3
+            ),
+            FaultCause::LawBroken { beats } => {
+                write!(f, "the law gave unusable numbers in {beats} beats of one second")
+            }
+            FaultCause::LinkLost => write!(f, "the link to the robot is lost"),
+            FaultCause::StateStale { age_ns, limit_ns } => {
+                write!(f, "robot state is {:.1} ms old (limit {:.1} ms): check the network", ms(age_ns), ms(limit_ns))
+            }
+            FaultCause::EchoStopped { for_ns } => {
+                write!(f, "the control script has not seen a new set-point for {:.0} ms", ms(for_ns))
+            }
+            FaultCause::SendBlocked { count } => write!(f, "{count} set-points in a row could not be sent"),
+            FaultCause::ProtectiveStop => write!(f, "protective stop: look at the pendant, then recover"),
+            FaultCause::EmergencyStop => write!(f, "emergency stop: release it on purpose, then recover"),
+            FaultCause::SafeguardStop => write!(f, "safeguard stop: clear the safeguard, then recover"),
+            FaultCause::SafetyFault { bits } => write!(f, "the controller reports a safety fault (bits {bits:#x})"),
+            FaultCause::NotRunning { mode } => write!(f, "the robot left mode running (robot_mode {mode})"),
+            FaultCause::ProgramStopped { runtime_state } => {
+                write!(f, "the control script was stopped or paused (runtime_state {runtime_state})")
+            }
+            FaultCause::ScriptFault { word } => write!(f, "the control script reports fault {word}"),
+            FaultCause::TokenChanged { expected, found } => {
+                write!(f, "another program commands the robot (token {found}, ours is {expected})")
+            }
+            FaultCause::ClockBack { by_s } => {
+                write!(f, "the controller's clock went back by {by_s:.3} s: it restarted")
+            }
+            FaultCause::TrackingError { joint, velocity, position } => {
+                write!(f, "joint {joint} does not follow: {velocity:.3} rad/s, {position:.3} rad off its set-points")
+            }
+            FaultCause::Uncommanded { joint, velocity } => {
+                write!(f, "joint {joint} moves at {velocity:.3} rad/s without being told to")
+            }
+            FaultCause::StateAbsurd { joint, value } => write!(f, "robot value of joint {joint} is absurd: {value}"),
+            FaultCause::Stalled { for_ns } => write!(f, "the loop stood still for {:.1} ms", ms(for_ns)),
+            FaultCause::TimeBack => write!(f, "the monotonic clock went back"),
+            FaultCause::Internal => write!(f, "a defect was caught inside the daemon; see the log"),
+        }
+    }
+}
+
+/// Why the loop stopped and waits for an operator to go on; nothing is latched.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum HoldCause {
+    /// H-01: too few marks are seen.
+    MarksLost,
+    /// H-02: the marks seen do not fix the motion (B12).
+    Geometry {
+        /// Smallest singular value, px/m.
+        sigma_min: f64,
+        /// Condition number.
+        condition: f64,
+    },
+    /// H-03: the arm is at a singularity (B11).
+    Singular {
+        /// Smallest singular value, m/s per rad/s.
+        sigma_min: f64,
+        /// The joint to bend away, 0 to 5.
+        joint: u8,
+    },
+    /// H-04: a joint is at the end of its range (B07).
+    JointEnd {
+        /// The joint, 0 to 5.
+        joint: u8,
+        /// Its position, rad.
+        position: f64,
+    },
+    /// H-05: no progress above the tolerance (G12).
+    NoProgress {
+        /// What is left, metres (unit-scaled).
+        left_m: f64,
+    },
+    /// H-06: the speed slider is at zero (B05).
+    SliderZero,
+    /// H-07: beats were missed too often (T02).
+    Overruns {
+        /// Beats missed in the last second.
+        count: u32,
+    },
+    /// H-08: pictures of the two eyes are too far apart in time (C06).
+    Skew {
+        /// Difference, ns.
+        skew_ns: u64,
+    },
+    /// H-09: the operator's lease ran out (O03).
+    LeaseLost,
+}
+
+impl HoldCause {
+    /// The stable code.
+    pub const fn code(&self) -> &'static str {
+        match self {
+            HoldCause::MarksLost => "H-01",
+            HoldCause::Geometry { .. } => "H-02",
+            HoldCause::Singular { .. } => "H-03",
+            HoldCause::JointEnd { .. } => "H-04",
+            HoldCause::NoProgress { .. } => "H-05",
+            HoldCause::SliderZero => "H-06",
+            HoldCause::Overruns { .. } => "H-07",
+            HoldCause::Skew { .. } => "H-08",
+            HoldCause::LeaseLost => "H-09",
+        }
+    }
+}
+
+impl fmt::Display for HoldCause {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            HoldCause::MarksLost => write!(f, "too few marks are seen: clear the view, then servo again"),
+            HoldCause::Geometry { sigma_min, condition } => write!(
+                f,
+                "the marks seen do not fix the motion (sigma {sigma_min:.1} px/m, condition {condition:.0}): show more marks"
+            ),
+            HoldCause::Singular { sigma_min, joint } => {
+                write!(f, "the arm is at a singularity (sigma {sigma_min:.4}): move joint {joint} away by hand")
+            }
+            HoldCause::JointEnd { joint, position } => {
+                write!(f, "joint {joint} is at the end of its range ({position:.3} rad)")
+            }
+            HoldCause::NoProgress { left_m } => write!(f, "no progress with {:.2} mm left", left_m * 1e3),
+            HoldCause::SliderZero => write!(f, "the speed slider is at zero"),
+            HoldCause::Overruns { count } => write!(f, "{count} beats were missed within one second"),
+            HoldCause::Skew { skew_ns } => {
+                write!(f, "the two eyes' pictures are {:.1} ms apart", *skew_ns as f64 * 1e-6)
+            }
+            HoldCause::LeaseLost => write!(f, "the operator's lease ran out"),
+        }
+    }
+}
+
+/// Why a request is refused; nothing changed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reject {
+    /// Not in this mode.
+    WrongMode,
+    /// No set-point is loaded.
+    NoSetPoint,
+    /// Marks are not tracked.
+    NoMarks,
+    /// The robot is not ready: no link, no state, not running, no program.
+    RobotNotReady,
+    /// The fault's cause is still there.
+    CausePresent,
+    /// A set-point cannot change while the arm moves.
+    Moving,
+    /// The set-point is not made of finite numbers, or shows too few marks.
+    BadSetPoint,
+    /// The goal, or the way to it, is out of the arm's reach or range.
+    OutOfReach,
+    /// Too few marks stay in the pictures on the way.
+    PathLeavesView,
+    /// Data has not been good for long enough since the hold.
+    Settling,
+    /// A number in the request is not finite or out of range.
+    BadValue,
+}
+
+impl Reject {
+    /// In words, with what to do.
+    pub const fn reason(self) -> &'static str {
+        match self {
+            Reject::WrongMode => "not possible in this mode",
+            Reject::NoSetPoint => "no set-point is loaded: send a plan first",
+            Reject::NoMarks => "the marks are not tracked: check the pictures and the gripper file",
+            Reject::RobotNotReady => "the robot is not ready: power on, release the brakes, start the control script",
+            Reject::CausePresent => "the cause of the fault is still there",
+            Reject::Moving => "the set-point cannot change while the arm moves: stop first",
+            Reject::BadSetPoint => "the set-point is incomplete or shows too few marks",
+            Reject::OutOfReach => "the goal or the way to it is out of the arm's reach: move the part or the arm",
+            Reject::PathLeavesView => "too few marks stay in the pictures on the way: move the arm closer or the rig",
+            Reject::Settling => "wait until pictures and robot state have been good for 200 ms",
+            Reject::BadValue => "a value of the request is out of range",
+        }
+    }
+}

@@ -1,0 +1,348 @@
+//! The modes of the loop, and the one table that leads from one to another.
+
+mod fault;
+
+pub use fault::{FaultCause, HoldCause, Reject};
+
+/// A mode.
+///
+/// ```text
+///            marks tracked,            set-point, arm                servo
+///            robot ready                                    (probe first, <= 10 % speed)
+///  ┌──────┐ ─────────────► ┌──────────┐ ─────────► ┌───────┐ ─────────► ┌──────────┐  error small   ┌───────────┐
+///  │ Idle │                │ Tracking │            │ Armed │            │ Servoing │ ─────────────► │ Converged │
+///  └──────┘ ◄───────────── └──────────┘ ◄───────── └───────┘            └──────────┘ ◄───────────── └───────────┘
+///     ▲      marks lost,      ▲          disarm        ▲                      │    error grew, turn,     │
+///     │      robot not ready  │                        │ hold (servo          │    retreat               │
+///     │                       │                        │ goes on)             ▼                          │
+///     │                       │ stop request      ┌────┴─────────────────────────┐                       │
+///     │ reset                 └───────────────────│ Stopping: bounded ramp, then │ ◄─────────────────────┘
+///     │ (moves nothing)                           └──────────────────────────────┘
+///  ┌──┴────┐                  fault, rates at zero      │
+///  │ Fault │ ◄──────────────────────────────────────────┘  ◄── from Armed as well, where nothing moves
+///  └───────┘   the first cause stays until reset
+/// ```
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Mode {
+    /// Marks are not tracked or the robot is not ready; nothing may move.
+    Idle,
+    /// Marks are tracked and the robot is ready.
+    Tracking,
+    /// A set-point is accepted and the operator has armed; nothing moves yet.
+    Armed,
+    /// The law drives the arm.
+    Servoing,
+    /// The marks lie on the set-point; the loop stays closed and holds them there.
+    Converged,
+    /// The rates shrink to zero.
+    Stopping(After),
+    /// Latched: the first cause and when.
+    Fault(Latched),
+}
+
+/// What follows a stop.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum After {
+    /// An operator's stop: back to tracking, disarmed.
+    Tracking,
+    /// A hold: armed still; `servo` goes on.
+    Armed(HoldCause),
+    /// A fault.
+    Fault(Latched),
+}
+
+/// A fault's first cause.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Latched {
+    /// What it was.
+    pub cause: FaultCause,
+    /// When it was noticed, CLOCK_MONOTONIC ns.
+    pub at_ns: u64,
+}
+
+/// A mode's name without its data, for telemetry and tables.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[repr(u8)]
+#[allow(missing_docs)]
+pub enum ModeName {
+    Idle = 0,
+    Tracking = 1,
+    Armed = 2,
+    Servoing = 3,
+    Converged = 4,
+    Stopping = 5,
+    Fault = 6,
+}
+
+impl ModeName {
+    /// In words, as logs and console write it.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            ModeName::Idle => "idle",
+            ModeName::Tracking => "tracking",
+            ModeName::Armed => "armed",
+            ModeName::Servoing => "servoing",
+            ModeName::Converged => "converged",
+            ModeName::Stopping => "stopping",
+            ModeName::Fault => "fault",
+        }
+    }
+}
+
+impl Mode {
+    /// The name without the data.
+    pub const fn name(&self) -> ModeName {
+        match self {
+            Mode::Idle => ModeName::Idle,
+            Mode::Tracking => ModeName::Tracking,
+            Mode::Armed => ModeName::Armed,
+            Mode::Servoing => ModeName::Servoing,
+            Mode::Converged => ModeName::Converged,
+            Mode::Stopping(_) => ModeName::Stopping,
+            Mode::Fault(_) => ModeName::Fault,
+        }
+    }
+
+    /// Whether the law may drive the arm. In every other mode but `Stopping` the rates are zero.
+    pub const fn drives(&self) -> bool {
+        matches!(self, Mode::Servoing | Mode::Converged)
+    }
+
+    /// The latched fault, also while its stop ramp still runs.
+    pub const fn fault(&self) -> Option<&Latched> {
+        match self {
+            Mode::Fault(l) | Mode::Stopping(After::Fault(l)) => Some(l),
+            _ => None,
+        }
+    }
+}
+
+/// What can lead to another mode.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Event {
+    /// Marks are tracked and the robot is ready.
+    Ready,
+    /// One of the two is no longer so.
+    NotReady,
+    /// Operator: arm; `Err` says what is missing.
+    Arm(Result<(), Reject>),
+    /// Operator: disarm.
+    Disarm,
+    /// Operator: go; `Err` says what is missing.
+    Servo(Result<(), Reject>),
+    /// Operator: stop. Never refused.
+    Stop,
+    /// Operator: clear the fault; whether its cause is gone.
+    Reset {
+        /// Whether the cause is gone.
+        cause_gone: bool,
+    },
+    /// Operator, after convergence: turn the valve or retreat with the loop closed; `Err` says what is wrong.
+    Task(Result<(), Reject>),
+    /// The last leg is done and the error is small.
+    Reached,
+    /// The error grew again.
+    Receded,
+    /// The rates have come to zero.
+    AtRest,
+    /// Something asks for a stop that the operator may end.
+    Hold(HoldCause),
+    /// Something asks for a stop that latches.
+    Fault(FaultCause),
+}
+
+/// What a step asks the caller to do.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Action {
+    /// Nothing.
+    None,
+    /// The mode changed; nothing else is to be done.
+    Changed,
+    /// The mode changed: begin the motion (the path starts where the gripper is).
+    Begin,
+    /// The mode changed: ramp down.
+    RampDown,
+    /// The request is refused and the mode is as it was.
+    Refuse(Reject),
+}
+
+/// The next mode and what to do, for every mode and every event.
+///
+/// Total: a pair that the table does not name leaves the mode alone, and a request among those is refused.
+pub const fn step(mode: Mode, event: Event, now_ns: u64) -> (Mode, Action) {
+    use Mode::{Armed, Converged, Fault, Idle, Servoing, Stopping, Tracking};
+    match (mode, event) {
+        // A fault latches wherever the arm is or was to be driven; where it is not, lacking readiness says the same.
+        (Servoing | Converged, Event::Fault(cause)) => {
+            (Stopping(After::Fault(Latched { cause, at_ns: now_ns })), Action::RampDown)
+        }
+        (Armed, Event::Fault(cause)) => (Fault(Latched { cause, at_ns: now_ns }), Action::Changed),
+        (Stopping(After::Fault(_)), Event::Fault(_)) => (mode, Action::None),
+        (Stopping(_), Event::Fault(cause)) => (Stopping(After::Fault(Latched { cause, at_ns: now_ns })), Action::None),
+        (Idle | Tracking | Fault(_), Event::Fault(_)) => (mode, Action::None),
+
+        (Servoing | Converged, Event::Hold(cause)) => (Stopping(After::Armed(cause)), Action::RampDown),
+        (_, Event::Hold(_)) => (mode, Action::None),
+
+        // A stop is never refused. It makes a hold final, and leaves a fault a fault.
+        (Servoing | Converged, Event::Stop) => (Stopping(After::Tracking), Action::RampDown),
+        (Stopping(After::Armed(_)), Event::Stop) => (Stopping(After::Tracking), Action::None),
+        (Armed, Event::Stop) => (Tracking, Action::Changed),
+        (Idle | Tracking | Stopping(_) | Fault(_), Event::Stop) => (mode, Action::None),
+
+        (Stopping(After::Tracking), Event::AtRest) => (Tracking, Action::Changed),
+        (Stopping(After::Armed(_)), Event::AtRest) => (Armed, Action::Changed),
+        (Stopping(After::Fault(latched)), Event::AtRest) => (Fault(latched), Action::Changed),
+        (_, Event::AtRest) => (mode, Action::None),
+
+        (Fault(_), Event::Reset { cause_gone: true }) => (Idle, Action::Changed),
+        (Fault(_), Event::Reset { cause_gone: false }) => (mode, Action::Refuse(Reject::CausePresent)),
+        (_, Event::Reset { .. }) => (mode, Action::Refuse(Reject::WrongMode)),
+
+        (Idle, Event::Ready) => (Tracking, Action::Changed),
+        (Tracking | Armed, Event::NotReady) => (Idle, Action::Changed),
+        (_, Event::Ready | Event::NotReady) => (mode, Action::None),
+
+        (Tracking, Event::Arm(Ok(()))) => (Armed, Action::Changed),
+        (Tracking, Event::Arm(Err(reject))) => (mode, Action::Refuse(reject)),
+        (Idle, Event::Arm(Err(reject))) => (mode, Action::Refuse(reject)),
+        (_, Event::Arm(_)) => (mode, Action::Refuse(Reject::WrongMode)),
+        (Armed, Event::Disarm) => (Tracking, Action::Changed),
+        (_, Event::Disarm) => (mode, Action::Refuse(Reject::WrongMode)),
+
+        (Armed, Event::Servo(Ok(()))) => (Servoing, Action::Begin),
+        (Armed, Event::Servo(Err(reject))) => (mode, Action::Refuse(reject)),
+        (_, Event::Servo(_)) => (mode, Action::Refuse(Reject::WrongMode)),
+
+        (Converged, Event::Task(Ok(()))) => (Servoing, Action::Begin),
+        (Converged, Event::Task(Err(reject))) => (mode, Action::Refuse(reject)),
+        (_, Event::Task(_)) => (mode, Action::Refuse(Reject::WrongMode)),
+
+        (Servoing, Event::Reached) => (Converged, Action::Changed),
+        (Converged, Event::Receded) => (Servoing, Action::Changed),
+        (_, Event::Reached | Event::Receded) => (mode, Action::None),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CAUSE: FaultCause = FaultCause::LinkLost;
+    const FIRST: Latched = Latched { cause: FaultCause::ProtectiveStop, at_ns: 7 };
+    const MODES: [Mode; 9] = [
+        Mode::Idle,
+        Mode::Tracking,
+        Mode::Armed,
+        Mode::Servoing,
+        Mode::Converged,
+        Mode::Stopping(After::Tracking),
+        Mode::Stopping(After::Armed(HoldCause::MarksLost)),
+        Mode::Stopping(After::Fault(FIRST)),
+        Mode::Fault(FIRST),
+    ];
+    const EVENTS: [Event; 17] = [
+        Event::Ready,
+        Event::NotReady,
+        Event::Arm(Ok(())),
+        Event::Arm(Err(Reject::NoMarks)),
+        Event::Disarm,
+        Event::Servo(Ok(())),
+        Event::Servo(Err(Reject::NoMarks)),
+        Event::Stop,
+        Event::Reset { cause_gone: true },
+        Event::Reset { cause_gone: false },
+        Event::Task(Ok(())),
+        Event::Task(Err(Reject::BadValue)),
+        Event::Reached,
+        Event::Receded,
+        Event::AtRest,
+        Event::Hold(HoldCause::MarksLost),
+        Event::Fault(CAUSE),
+    ];
+
+    /// One letter a cell: where each pair leads. Idle, Tracking, Armed, Servoing, Converged, Stopping (t, a, f by what follows),
+    /// Fault; `.` stays, `x` is refused. Columns as in `EVENTS`.
+    const TABLE: [&str; 9] = [
+        "T.xxxxx.xxxx.....", // Idle
+        ".IAxxxx.xxxx.....", // Tracking
+        ".IxxTSxTxxxx....F", // Armed
+        "..xxxxxtxxxxC..af", // Servoing
+        "..xxxxxtxxSx.S.af", // Converged
+        "..xxxxx.xxxx..T.f", // Stopping, then tracking
+        "..xxxxxtxxxx..A.f", // Stopping, then armed
+        "..xxxxx.xxxx..F..", // Stopping, then fault
+        "..xxxxx.Ixxx.....", // Fault
+    ];
+
+    fn letter(m: &Mode) -> char {
+        match m {
+            Mode::Idle => 'I',
+            Mode::Tracking => 'T',
+            Mode::Armed => 'A',
+            Mode::Servoing => 'S',
+            Mode::Converged => 'C',
+            Mode::Stopping(After::Tracking) => 't',
+            Mode::Stopping(After::Armed(_)) => 'a',
+            Mode::Stopping(After::Fault(_)) => 'f',
+            Mode::Fault(_) => 'F',
+        }
+    }
+
+    #[test]
+    fn every_mode_meets_every_event_as_the_table_says() {
+        for (mode, row) in MODES.iter().zip(TABLE) {
+            assert_eq!(row.len(), EVENTS.len(), "{mode:?}");
+            for (event, want) in EVENTS.iter().zip(row.chars()) {
+                let (next, action) = step(*mode, *event, 99);
+                match want {
+                    'x' => {
+                        assert!(matches!(action, Action::Refuse(_)), "{mode:?} {event:?} {action:?}");
+                        assert_eq!(next, *mode);
+                    }
+                    '.' => assert_eq!((next, action), (*mode, Action::None), "{mode:?} {event:?}"),
+                    c => {
+                        assert_eq!(letter(&next), c, "{mode:?} {event:?}");
+                        assert!(!matches!(action, Action::Refuse(_)));
+                        // Motion begins, and ends, with an action that says so.
+                        assert_eq!(
+                            matches!(action, Action::Begin),
+                            next.drives() && !matches!(event, Event::Reached | Event::Receded)
+                        );
+                        let stops = mode.drives() && matches!(next, Mode::Stopping(_));
+                        assert_eq!(matches!(action, Action::RampDown), stops, "{mode:?} {event:?}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_first_cause_stays_until_a_reset() {
+        let mut mode = step(Mode::Servoing, Event::Fault(FaultCause::ProtectiveStop), 7).0;
+        for (k, e) in EVENTS.iter().cycle().take(170).enumerate() {
+            if matches!(e, Event::Reset { cause_gone: true }) {
+                continue;
+            }
+            mode = step(mode, *e, 100 + k as u64).0;
+            assert_eq!(mode.fault(), Some(&FIRST), "{e:?}");
+        }
+        assert_eq!(step(mode, Event::Reset { cause_gone: true }, 999).0, Mode::Idle);
+    }
+
+    #[test]
+    fn only_arm_then_servo_leads_from_rest_to_motion() {
+        for mode in MODES {
+            for event in EVENTS {
+                let (next, _) = step(mode, event, 0);
+                if next.drives() && !mode.drives() {
+                    assert_eq!((mode, event), (Mode::Armed, Event::Servo(Ok(()))));
+                }
+                if next == Mode::Armed && mode != Mode::Armed {
+                    let resumed = matches!(mode, Mode::Stopping(After::Armed(_)));
+                    assert!(resumed || (mode, event) == (Mode::Tracking, Event::Arm(Ok(()))));
+                }
+            }
+        }
+    }
+}
