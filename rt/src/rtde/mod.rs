@@ -7,6 +7,8 @@
 //!    [`Version`]s; `parse` borrows, `emit` writes into a caller's buffer.
 //! 3. [`Field`] knows every variable of the protocol by name and type; a [`Recipe`] is an ordered choice of them, and a
 //!    [`Slot`] the resolved place of one value.
+//! 4. [`Session`] is the client's half of the conversation: what to send next, and what an answer means.
+//! 5. [`StateReader`] and [`CommandWriter`] are graspd's own recipes; [`GapMeter`] counts what the controller left out.
 //!
 //! All numbers are big-endian. A server is written with the same pieces as a client:
 //!
@@ -25,16 +27,22 @@
 //! assert_eq!(bytes[..n], [0, 4, b'V', 1]);
 //! ```
 
+mod client;
 mod fields;
 mod frame;
 mod message;
 mod recipe;
+mod robot;
 mod value;
 
+pub use client::{ClientError, Event, MAX_FIELDS, MAX_INPUT_RECIPES, MAX_NAME_LIST, Phase, Session, SessionRecipe};
 pub use fields::{Field, INPUT_COUNT, OUTPUT_COUNT, Side};
 pub use frame::{FrameError, Framer, HEADER, MAX_PACKAGE, Package};
 pub use message::{
     ClientMessage, ControllerMessage, ControllerVersion, Kind, Level, MessageError, NoRoom, Text, Version,
 };
 pub use recipe::{Answer, Entry, Recipe, RecipeError, Slot, answers, join, names};
+pub use robot::{
+    COMMAND_FIELDS, ClockStep, CommandWriter, GapMeter, SCRIPT_VERSION, STATE_FIELDS, StateReader, script_state,
+};
 pub use value::{FieldType, Value, Wire};
