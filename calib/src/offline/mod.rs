@@ -1,4 +1,8 @@
 //! The off-line stage, one file per step of the paper: from edge points in two views to a rim in space and a grasp on it.
 
+pub mod conic;
+pub mod eigen;
+mod levenberg;
 pub mod model;
 pub mod refusal;
+pub mod sampson;
