@@ -66,8 +66,8 @@ pub(crate) fn minimise<const N: usize, P: Problem<N>>(
             mu = (mu * 10.0).max(1e-9);
         }
         let Some((next, size, cost)) = accepted else {
-            // No step lowers the cost: the minimum to rounding if the predicted decrease is nil.
-            converged = gain(&at, n).is_some_and(|g| g <= 1e-9 * at.cost.max(f64::MIN_POSITIVE));
+            // No step lowers the cost: the minimum to rounding if the full step is nil or promises nothing.
+            converged = full_step(&at, n).is_some_and(|(size, gain)| size <= 1e-8 || gain <= 1e-9 * at.cost);
             break;
         };
         let small = size < 1e-11 || (at.cost - cost <= 1e-13 * at.cost && mu <= 1e-3);
@@ -82,9 +82,9 @@ pub(crate) fn minimise<const N: usize, P: Problem<N>>(
     at.cost.is_finite().then_some(Minimum { state, cost: at.cost, normal: at.normal, converged })
 }
 
-/// Decrease of the cost that the undamped step promises.
-fn gain<const N: usize>(at: &Linear<N>, n: usize) -> Option<f64> {
+/// Length of the undamped step, and the decrease of the cost that it promises.
+fn full_step<const N: usize>(at: &Linear<N>, n: usize) -> Option<(f64, f64)> {
     let l = eigen::cholesky(&at.normal, n)?;
     let d = eigen::solve(&l, &at.gradient, n);
-    Some(d.dot(&at.gradient))
+    Some((d.norm(), d.dot(&at.gradient)))
 }

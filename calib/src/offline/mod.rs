@@ -12,6 +12,7 @@ pub mod model;
 pub mod pencil;
 pub mod planar;
 pub mod plane;
+pub mod reconstruct;
 pub mod refusal;
 pub mod robust;
 pub mod sampson;

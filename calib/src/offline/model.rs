@@ -9,7 +9,7 @@
 //!
 //! Lengths are in whatever unit the projection matrices use (metres in graspd, millimetres in the golden cases).
 
-use nalgebra::{Matrix2, Matrix3, Matrix3x4, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix3, Matrix3x2, Matrix3x4, Vector2, Vector3};
 
 /// A finite camera, `u = P x` (paper equation 1): pixels free of distortion from homogeneous points. Scale and sign do not matter.
 pub type Projection = Matrix3x4<f64>;
@@ -225,6 +225,8 @@ pub struct Reconstruction {
     pub cov_centre: Matrix3<f64>,
     /// Covariance of the normal, radians squared, in the columns `e1, e2` of [`super::circle::frame_of`] the normal.
     pub cov_normal: Matrix2<f64>,
+    /// Covariance of the centre (rows) against the normal (columns `e1, e2`).
+    pub cov_centre_normal: Matrix3x2<f64>,
     /// Covariance of `(a, b)`; of `(R, r)` for a round bar.
     pub cov_axes: Matrix2<f64>,
     /// Figures by which to judge it.
