@@ -5,14 +5,15 @@
 
 use crate::offline::circle::{ClosedForm, vergence};
 use crate::offline::cone::project;
-use crate::offline::conic::{ellipse_of, fit_direct};
+use crate::offline::conic::{ellipse_of, fit_direct, fit_ml};
 use crate::offline::handle::{grasp_circle, grasp_ellipse};
 use crate::offline::ml::MlFit;
-use crate::offline::model::{EdgePoint, Ellipse2, Noise, Options, Projection, Rim, RimChoice};
+use crate::offline::model::{EdgePoint, Ellipse2, Noise, Options, Projection, Rim, RimChoice, Scatter};
 use crate::offline::planar::{Analysis, analyse};
 use crate::offline::reconstruct::choose_plane_model;
+use crate::offline::sampson::distance;
 use crate::offline::visibility::{Eye, FlatMark};
-use nalgebra::{Isometry3, Matrix2, Matrix3, Point3, Vector3};
+use nalgebra::{Isometry3, Matrix2, Matrix3, Point3, Vector2, Vector3};
 use serde_json::{Map, Value, json};
 
 /// Why a whole file cannot be processed.
@@ -184,8 +185,32 @@ fn options(sigma: f64) -> Options {
     }
 }
 
+/// Tells from the points themselves whether they scatter across the contour only.
+///
+/// A case does not say. Points taken at equal steps along a contour keep their step to far better than they scatter across it when the
+/// noise is across only; isotropic noise spoils the step as much as the distance. Irregular points count as isotropic.
+fn scatter(points: &[Vec<EdgePoint>; 2]) -> Scatter {
+    let across = points.iter().all(|list| {
+        let Ok(fit) = fit_ml(list, Scatter::Isotropic) else { return false };
+        let feet: Vec<Vector2<f64>> = list
+            .iter()
+            .map(|p| {
+                let g = fit.conic * Vector3::new(p.uv.x, p.uv.y, 1.0);
+                p.uv - Vector2::new(g.x, g.y).normalize() * distance(&fit.conic, &p.uv)
+            })
+            .collect();
+        let steps: Vec<f64> = feet.windows(2).map(|w| (w[1] - w[0]).norm()).collect();
+        let jumps: Vec<f64> = steps.windows(2).map(|w| w[1] - w[0]).collect();
+        let along = (jumps.iter().map(|j| j * j).sum::<f64>() / (6.0 * jumps.len().max(1) as f64)).sqrt();
+        let scattered =
+            (list.iter().map(|p| distance(&fit.conic, &p.uv).powi(2)).sum::<f64>() / list.len() as f64).sqrt();
+        list.len() >= 20 && along < 0.25 * scattered
+    });
+    if across { Scatter::Across } else { Scatter::Isotropic }
+}
+
 fn reconstruct_case(case: &Case, marks: Option<&[FlatMark]>) -> Result<Map<String, Value>, String> {
-    let options = options(case.sigma);
+    let options = Options { scatter: scatter(&case.points), ..options(case.sigma) };
     let p = [&case.p[0], &case.p[1]];
     let a = analyse([&case.points[0], &case.points[1]], p, &options).map_err(|e| e.to_string())?;
     a.verdict.clone().map_err(|e| e.to_string())?;

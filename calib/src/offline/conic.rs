@@ -4,7 +4,7 @@
 
 use super::eigen;
 use super::levenberg::{self, Linear, Problem};
-use super::model::{EdgePoint, Ellipse2};
+use super::model::{EdgePoint, Ellipse2, Scatter};
 use super::sampson::{Cloud, Coefficients, coefficients};
 use nalgebra::{Matrix2, Matrix3, Matrix5, SMatrix, SVector, Vector2, Vector3};
 use std::f64::consts::PI;
@@ -305,23 +305,15 @@ impl Problem<5> for OneView<'_> {
 /// Refines the direct fit to the minimum of the summed squared Sampson distances, with covariance.
 ///
 /// Sampson distances have zero mean to second order under isotropic noise (literature-conics), so this is the maximum-likelihood fit.
-pub fn fit_ml(points: &[EdgePoint], keep: Option<&[bool]>) -> Result<EllipseFit, FitError> {
-    let kept: Vec<EdgePoint>;
-    let points = match keep {
-        Some(k) => {
-            kept = points.iter().zip(k).filter(|(_, k)| **k).map(|(p, _)| *p).collect();
-            &kept
-        }
-        None => points,
-    };
+pub fn fit_ml(points: &[EdgePoint], scatter: Scatter) -> Result<EllipseFit, FitError> {
     let start = fit_direct(points)?;
-    refine(points, &start)
+    refine(points, &start, scatter)
 }
 
 /// The geometric fit from a given start.
-pub fn refine(points: &[EdgePoint], start: &Matrix3<f64>) -> Result<EllipseFit, FitError> {
+pub fn refine(points: &[EdgePoint], start: &Matrix3<f64>, scatter: Scatter) -> Result<EllipseFit, FitError> {
     let e = ellipse_of(start).ok_or(FitError::NotAnEllipse)?;
-    let cloud = Cloud::new(points, None, e.centre, e.a);
+    let cloud = Cloud::new(points, None, e.centre, e.a, scatter);
     let (sin, cos) = e.theta.sin_cos();
     let r = Matrix2::new(cos, -sin, sin, cos);
     let s = r * Matrix2::new(1.0, 0.0, 0.0, e.b / e.a) * r.transpose();
@@ -376,7 +368,7 @@ mod tests {
             [arc(&some(), 0.0, 6.28, 60, 0.0), arc(&some(), 0.0, 6.2, 5, 0.0), arc(&some(), 1.0, 2.5, 50, 0.0)]
         {
             let direct = ellipse_of(&fit_direct(&points).unwrap()).unwrap();
-            let ml = fit_ml(&points, None).unwrap().ellipse;
+            let ml = fit_ml(&points, Scatter::Isotropic).unwrap().ellipse;
             for e in [direct, ml] {
                 assert!((e.centre - some().centre).norm() < 1e-6, "{e:?}");
                 assert!((e.a - 71.0).abs() < 1e-6 && (e.b - 39.0).abs() < 1e-6, "{e:?}");
@@ -387,17 +379,17 @@ mod tests {
     #[test]
     fn lines_hyperbolas_and_short_arcs_are_refused() {
         let line: Vec<_> = (0..50).map(|i| EdgePoint::new(f64::from(i), 3.0 + 2.0 * f64::from(i), 1.0)).collect();
-        assert_eq!(fit_ml(&line, None).unwrap_err(), FitError::Collinear);
-        assert!(matches!(fit_ml(&line[..4], None), Err(FitError::TooFew(4))));
+        assert_eq!(fit_ml(&line, Scatter::Isotropic).unwrap_err(), FitError::Collinear);
+        assert!(matches!(fit_ml(&line[..4], Scatter::Isotropic), Err(FitError::TooFew(4))));
         let short = arc(&some(), 1.0, 1.25, 60, 0.3);
-        assert!(matches!(fit_ml(&short, None), Err(FitError::ArcTooShort(_) | FitError::NotAnEllipse)));
+        assert!(matches!(fit_ml(&short, Scatter::Isotropic), Err(FitError::ArcTooShort(_) | FitError::NotAnEllipse)));
         let hyperbola: Vec<_> = (-20..=20)
             .map(|i| f64::from(i) * 0.2)
             .map(|t| EdgePoint::new(90.0 * t.cosh(), 60.0 * t.sinh(), 1.0))
             .collect();
         // The direct fit always finds some ellipse; its residuals give it away.
-        assert!(fit_ml(&hyperbola, None).map_or(true, |f| f.noise > 20.0));
+        assert!(fit_ml(&hyperbola, Scatter::Isotropic).map_or(true, |f| f.noise > 20.0));
         let nan = vec![EdgePoint::new(f64::NAN, 0.0, 1.0); 9];
-        assert_eq!(fit_ml(&nan, None).unwrap_err(), FitError::NotFinite);
+        assert_eq!(fit_ml(&nan, Scatter::Isotropic).unwrap_err(), FitError::NotFinite);
     }
 }

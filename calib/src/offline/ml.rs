@@ -321,7 +321,7 @@ impl Problem<8> for RimProblem<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::offline::model::EdgePoint;
+    use crate::offline::model::{EdgePoint, Scatter};
     use crate::offline::synthetic::{rig, rim_points, rim_tilted};
 
     fn views(noise: f64) -> (TwoViews, Rim) {
@@ -335,7 +335,7 @@ mod tests {
                     EdgePoint::new(u.x + noise * (i as f64 * 9.1).sin(), u.y + noise * (i as f64 * 5.7).cos(), 1.0)
                 })
                 .collect();
-            Cloud::new(&points, None, points[0].uv, 50.0)
+            Cloud::new(&points, None, points[0].uv, 50.0, Scatter::Isotropic)
         });
         (TwoViews::new(clouds, [&p[0], &p[1]]), rim)
     }

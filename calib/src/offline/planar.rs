@@ -73,9 +73,9 @@ pub(crate) fn typical_sigma(points: &[EdgePoint]) -> f64 {
 /// Ellipse fit of a view with the refusals that concern one view.
 fn fit_view(points: &[EdgePoint], view: View, options: &Options) -> Result<RobustFit, Refusal> {
     let fitted = if options.robust {
-        robust::fit(points)
+        robust::fit(points, options.scatter)
     } else {
-        fit_ml(points, None).map(|fit| RobustFit { fit, inliers: vec![true; points.len()] })
+        fit_ml(points, options.scatter).map(|fit| RobustFit { fit, inliers: vec![true; points.len()] })
     };
     let fitted = fitted.map_err(|e| match e {
         FitError::TooFew(count) => Refusal::TooFewPoints { view, count, needed: 5 },
@@ -120,7 +120,7 @@ pub fn analyse(points: [&[EdgePoint]; 2], p: [&Projection; 2], options: &Options
     let polar = polar(&cones).and_then(|pair| extract(&cones, pair, true));
     let clouds = [0, 1].map(|k| {
         let e = &fits[k].fit.ellipse;
-        Cloud::new(points[k], Some(&fits[k].inliers), e.centre, e.a)
+        Cloud::new(points[k], Some(&fits[k].inliers), e.centre, e.a, options.scatter)
     });
     let views = TwoViews::new(clouds, p);
     let (ellipse, circle) = refine(&views, &paper, &polar, p, &centres);
@@ -180,11 +180,11 @@ fn refine(
     {
         starts.truncate(1);
     }
-    let Some(first) = starts.first().copied() else {
+    if starts.is_empty() {
         let why = polar.as_ref().err().or(paper.as_ref().err()).cloned();
         let why = why.unwrap_or(Refusal::OppositeSides { why: "the closed form lies behind a camera or faces away" });
         return (Err(why.clone()), Err(why));
-    };
+    }
     let ellipse = best(views, &starts, RimModel::Ellipse, p, centres);
     let mut round: Vec<Rim> = starts;
     if let Ok(fit) = &ellipse {
@@ -195,7 +195,6 @@ fn refine(
         }
     }
     let circle = best(views, &round, RimModel::Circle, p, centres);
-    let _ = first;
     (ellipse, circle)
 }
 

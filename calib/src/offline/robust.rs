@@ -4,7 +4,7 @@
 //! inliers' Cramer-Rao bound, and forgets everything farther away.
 
 use super::conic::{EllipseFit, FitError, fit_direct, fit_ml, refine};
-use super::model::EdgePoint;
+use super::model::{EdgePoint, Scatter};
 use super::sampson::distance;
 use nalgebra::Matrix3;
 
@@ -32,8 +32,8 @@ pub struct RobustFit {
 /// Fits an ellipse to points some of which may not belong to it at all (up to about 40 %).
 ///
 /// Points without outliers give exactly the plain fit. Deterministic: the same points in the same order give the same bits.
-pub fn fit(points: &[EdgePoint]) -> Result<RobustFit, FitError> {
-    let plain = fit_ml(points, None);
+pub fn fit(points: &[EdgePoint], scatter: Scatter) -> Result<RobustFit, FitError> {
+    let plain = fit_ml(points, scatter);
     if let Ok(fit) = &plain
         && clean(points, fit)
         && !bettered(points, fit)
@@ -48,7 +48,7 @@ pub fn fit(points: &[EdgePoint]) -> Result<RobustFit, FitError> {
         return Err(e);
     }
     let (_, start) = consensus(points, plain.as_ref().ok(), SAMPLES).ok_or(FitError::NotAnEllipse)?;
-    polish(points, &start)
+    polish(points, &start, scatter)
 }
 
 /// Whether the residuals look like noise: no point beyond the gate (widened for the largest of many), and no heavy tail.
@@ -103,7 +103,7 @@ fn consensus(points: &[EdgePoint], plain: Option<&EllipseFit>, samples: usize) -
 }
 
 /// Alternates gate and geometric fit until the set of inliers stands still.
-fn polish(points: &[EdgePoint], start: &Matrix3<f64>) -> Result<RobustFit, FitError> {
+fn polish(points: &[EdgePoint], start: &Matrix3<f64>, scatter: Scatter) -> Result<RobustFit, FitError> {
     let mut conic = *start;
     let mut inliers = vec![false; points.len()];
     let mut last = None;
@@ -119,9 +119,9 @@ fn polish(points: &[EdgePoint], start: &Matrix3<f64>) -> Result<RobustFit, FitEr
             break;
         }
         let kept: Vec<EdgePoint> = points.iter().zip(&inliers).filter(|(_, k)| **k).map(|(p, _)| *p).collect();
-        let fit = match fit_direct(&kept).and_then(|c| refine(&kept, &c)) {
+        let fit = match fit_direct(&kept).and_then(|c| refine(&kept, &c, scatter)) {
             Ok(fit) => fit,
-            Err(_) => refine(&kept, &conic)?,
+            Err(_) => refine(&kept, &conic, scatter)?,
         };
         conic = fit.conic;
         last = Some(fit);
@@ -190,7 +190,7 @@ mod tests {
     fn forty_percent_scattered_or_a_spoke_do_not_move_the_fit() {
         for (outliers, clustered) in [(40, false), (80, false), (50, true)] {
             let (list, truth) = points(outliers, clustered);
-            let fit = fit(&list).unwrap();
+            let fit = fit(&list, Scatter::Isotropic).unwrap();
             let e = ellipse_of(&fit.fit.conic).unwrap();
             assert!((e.centre - truth.centre).norm() < 0.2, "{outliers} {clustered}: {e:?}");
             assert!((e.a - truth.a).abs() < 0.25 && (e.b - truth.b).abs() < 0.25, "{outliers} {clustered}: {e:?}");
@@ -202,9 +202,9 @@ mod tests {
     #[test]
     fn without_outliers_it_is_the_plain_fit() {
         let (list, _) = points(0, false);
-        let robust = fit(&list).unwrap();
+        let robust = fit(&list, Scatter::Isotropic).unwrap();
         assert!(robust.inliers.iter().all(|k| *k));
-        assert_eq!(robust.fit, fit_ml(&list, None).unwrap());
+        assert_eq!(robust.fit, fit_ml(&list, Scatter::Isotropic).unwrap());
         assert!(distance(&conic_of(&robust.fit.ellipse), &list[0].uv).abs() < 3.0);
     }
 }

@@ -4,7 +4,7 @@
 //! the coefficients by the model's parameters, the normal equations are `D^T A D` and `D^T g`. One pass over the points costs the
 //! same whatever the model, which is why a two-view fit with covariance takes a fraction of a millisecond.
 
-use super::model::EdgePoint;
+use super::model::{EdgePoint, Scatter};
 use nalgebra::{Matrix3, SMatrix, SVector, Vector2};
 
 /// Coefficients `c00, c01, c11, c02, c12, c22` of a symmetric 3x3 conic.
@@ -22,6 +22,8 @@ pub struct Cloud {
     pub centre: Vector2<f64>,
     /// Unit of the frame, pixels.
     pub scale: f64,
+    /// How the points scatter about the curve.
+    pub scatter: Scatter,
     points: Vec<Entry>,
 }
 
@@ -46,7 +48,13 @@ pub struct Sums {
 
 impl Cloud {
     /// The points in a frame at `centre` with unit `scale`; points whose `keep` is false are left out.
-    pub fn new(points: &[EdgePoint], keep: Option<&[bool]>, centre: Vector2<f64>, scale: f64) -> Self {
+    pub fn new(
+        points: &[EdgePoint],
+        keep: Option<&[bool]>,
+        centre: Vector2<f64>,
+        scale: f64,
+        scatter: Scatter,
+    ) -> Self {
         let used = |i: usize| keep.is_none_or(|k| k.get(i).copied().unwrap_or(false));
         let points = points
             .iter()
@@ -57,7 +65,7 @@ impl Cloud {
                 Entry { x: q.x, y: q.y, weight: scale / p.sigma }
             })
             .collect();
-        Self { centre, scale, points }
+        Self { centre, scale, scatter, points }
     }
 
     /// Number of points.
@@ -95,7 +103,15 @@ impl Cloud {
             let wx = c00 * p.x + c01 * p.y + c02;
             let wy = c01 * p.x + c11 * p.y + c12;
             let q = wx * p.x + wy * p.y + c02 * p.x + c12 * p.y + c22;
-            chi2 += q * q / (wx * wx + wy * wy) * (0.25 * p.weight * p.weight);
+            let n2 = wx * wx + wy * wy;
+            let mut r2 = 0.25 * q * q / n2;
+            if self.scatter == Scatter::Across {
+                // q / (2 n) + kappa (q / (2 n))^2 / 2 with the curvature kappa = bend / n^3.
+                let bend = c00 * wy * wy - 2.0 * c01 * wx * wy + c11 * wx * wx;
+                let grow = 1.0 + 0.25 * q * bend / (n2 * n2);
+                r2 *= grow * grow;
+            }
+            chi2 += r2 * p.weight * p.weight;
         }
         chi2
     }
@@ -113,9 +129,9 @@ impl Cloud {
             let q = wx * x + wy * y + c02 * x + c12 * y + c22;
             let n2 = wx * wx + wy * wy;
             let k = 0.5 * p.weight / n2.sqrt();
-            let r = q * k;
+            let mut r = q * k;
             let (tx, ty) = (wx * q / n2, wy * q / n2);
-            let d = [
+            let mut d = [
                 k * (x * x - tx * x),
                 k * (2.0 * x * y - tx * y - ty * x),
                 k * (y * y - ty * y),
@@ -123,6 +139,9 @@ impl Cloud {
                 k * (2.0 * y - ty),
                 k,
             ];
+            if self.scatter == Scatter::Across {
+                (r, d) = orthogonal(r, d, p, [c00, c01, c11], [wx, wy]);
+            }
             chi2 += r * r;
             for i in 0..6 {
                 g[i] += r * d[i];
@@ -139,6 +158,26 @@ impl Cloud {
     }
 }
 
+/// Turns a first-order distance and its derivative into the orthogonal distance `d + kappa d^2 / 2`, `kappa` the curvature there.
+fn orthogonal(r: f64, dr: [f64; 6], p: &Entry, c: [f64; 3], w: [f64; 2]) -> (f64, [f64; 6]) {
+    let ([c00, c01, c11], [wx, wy]) = (c, w);
+    let n2 = wx * wx + wy * wy;
+    let n3 = n2 * n2.sqrt();
+    let kappa = (c00 * wy * wy - 2.0 * c01 * wx * wy + c11 * wx * wx) / n3;
+    let (by_wx, by_wy) = (2.0 * (c11 * wx - c01 * wy), 2.0 * (c00 * wy - c01 * wx));
+    let dwx = [p.x, p.y, 0.0, 1.0, 0.0, 0.0];
+    let dwy = [0.0, p.x, p.y, 0.0, 1.0, 0.0];
+    let direct = [wy * wy, -2.0 * wx * wy, wx * wx, 0.0, 0.0, 0.0];
+    // Distances are weighted here; the plain one is d = r / weight.
+    let d = r / p.weight;
+    let out = core::array::from_fn(|i| {
+        let bend = (direct[i] + by_wx * dwx[i] + by_wy * dwy[i]) / n3;
+        let dkappa = bend - 3.0 * kappa / n2 * (wx * dwx[i] + wy * dwy[i]);
+        dr[i] * (1.0 + kappa * d) + 0.5 * d * d * dkappa * p.weight
+    });
+    (r * (1.0 + 0.5 * kappa * d), out)
+}
+
 /// Signed first-order distance of a pixel to a pixel conic, positive outside when the conic is oriented.
 pub fn distance(c: &Matrix3<f64>, uv: &Vector2<f64>) -> f64 {
     let wx = c[(0, 0)] * uv.x + c[(0, 1)] * uv.y + c[(0, 2)];
@@ -151,7 +190,7 @@ pub fn distance(c: &Matrix3<f64>, uv: &Vector2<f64>) -> f64 {
 mod tests {
     use super::*;
 
-    fn cloud() -> Cloud {
+    fn cloud(scatter: Scatter) -> Cloud {
         let points: Vec<_> = (0..40)
             .map(|i| {
                 let t = f64::from(i) * 0.157;
@@ -162,31 +201,34 @@ mod tests {
                 )
             })
             .collect();
-        Cloud::new(&points, None, Vector2::new(301.0, 199.0), 40.0)
+        Cloud::new(&points, None, Vector2::new(301.0, 199.0), 40.0, scatter)
     }
 
     #[test]
     fn sums_agree_with_finite_differences() {
-        let cloud = cloud();
-        let c = Coefficients::new(0.9, 0.05, 1.7, 0.02, -0.03, -1.1);
-        let s = cloud.sums(&c);
-        assert!((s.chi2 - cloud.chi2(&c)).abs() < 1e-9 * s.chi2);
-        for k in 0..6 {
-            let mut d = Coefficients::zeros();
-            d[k] = 1e-6;
-            let numeric = (cloud.chi2(&(c + d)) - cloud.chi2(&(c - d))) / 4e-6;
-            assert!((numeric - s.gradient[k]).abs() < 1e-5 * s.gradient.norm(), "coefficient {k}");
+        for scatter in [Scatter::Isotropic, Scatter::Across] {
+            let cloud = cloud(scatter);
+            let c = Coefficients::new(0.9, 0.05, 1.7, 0.02, -0.03, -1.1);
+            let s = cloud.sums(&c);
+            assert!((s.chi2 - cloud.chi2(&c)).abs() < 1e-9 * s.chi2);
+            for k in 0..6 {
+                let mut d = Coefficients::zeros();
+                d[k] = 1e-6;
+                let numeric = (cloud.chi2(&(c + d)) - cloud.chi2(&(c - d))) / 4e-6;
+                assert!((numeric - s.gradient[k]).abs() < 1e-5 * s.gradient.norm(), "coefficient {k}");
+            }
         }
     }
 
     #[test]
     fn the_distance_does_not_depend_on_the_frame_or_the_scale_of_the_conic() {
-        let cloud = cloud();
+        let cloud = cloud(Scatter::Isotropic);
         let c = Matrix3::new(0.9, 0.05, 0.02, 0.05, 1.7, -0.03, 0.02, -0.03, -1.1);
         let t = cloud.frame_from_pixels();
         let pixels = t.transpose() * c * t * 123.0;
         let one = EdgePoint::new(352.3, 215.0, 1.0);
-        let in_frame = Cloud::new(&[one], None, cloud.centre, cloud.scale).chi2(&coefficients(&c)).sqrt();
+        let in_frame =
+            Cloud::new(&[one], None, cloud.centre, cloud.scale, cloud.scatter).chi2(&coefficients(&c)).sqrt();
         assert!((in_frame - distance(&pixels, &one.uv).abs()).abs() < 1e-9);
     }
 }
