@@ -1,5 +1,6 @@
 //! The on-line stage, one file per arrow of the paper: frames in, gripper pose out.
 
+pub mod acquire;
 mod content;
 mod frame;
 pub mod interaction;

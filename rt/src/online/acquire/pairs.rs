@@ -1,0 +1,98 @@
+//! Which blob of the left picture may be which of the right, and where in space that would be.
+
+use super::blobs::{Blob, MAX_BLOBS};
+use crate::geom::{Normalized, Rig, Vec3, View};
+use crate::gripper::Gripper;
+use crate::math;
+use nalgebra::Vector3;
+
+/// Points kept; an ambiguous blob gives several.
+pub const MAX_POINTS: usize = 512;
+
+/// A possible mark in space.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct StereoPoint {
+    /// In the left frame, metres.
+    pub(crate) position: Vec3,
+    /// Radius of a disc of that picture at that distance, metres.
+    pub(crate) radius: f64,
+    pub(crate) dark: bool,
+    /// Index of the blob in each view.
+    pub(crate) blob: [u16; 2],
+}
+
+/// How far blobs may be from the epipolar line, pixels, and by which factor sizes may differ.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct PairLimits {
+    pub(crate) epipolar_px: f64,
+    pub(crate) size_factor: f64,
+}
+
+/// Pairs blobs of both views whose rays pass each other closely before both cameras, at a distance where a mark would look that large.
+pub(crate) fn pair(
+    rig: &Rig,
+    gripper: &Gripper,
+    blobs: &[heapless::Vec<Blob, MAX_BLOBS>; 2],
+    limits: &PairLimits,
+    out: &mut heapless::Vec<StereoPoint, MAX_POINTS>,
+) {
+    out.clear();
+    let left_from_right = rig.right_from_left.inverse();
+    let baseline = left_from_right.translation.vector;
+    let [left, right] = blobs;
+    // Rays of the right view once, not once per pair.
+    let mut rays: heapless::Vec<Option<Vec3>, MAX_BLOBS> = heapless::Vec::new();
+    for b in right {
+        let ray = rig.camera(View::Right).undistort(b.centre).map(|n| left_from_right.rotation * lift(n));
+        let _ = rays.push(ray);
+    }
+    let (fl, fr) = (0.5 * (rig.left.fx + rig.left.fy), 0.5 * (rig.right.fx + rig.right.fy));
+    for (i, l) in left.iter().enumerate() {
+        let Some(a) = rig.camera(View::Left).undistort(l.centre).map(lift) else { continue };
+        for (j, (r, b)) in right.iter().zip(&rays).enumerate() {
+            let Some(b) = b else { continue };
+            if l.dark != r.dark {
+                continue;
+            }
+            let Some((s, t)) = closest(&a, b, &baseline) else { continue };
+            if !(s > 0.0 && t > 0.0) {
+                continue;
+            }
+            let (p, q) = (a * s, baseline + b * t);
+            // The gap between the rays as seen from either camera, in pixels.
+            let gap = math::sqrt((p - q).norm_squared()) * fl / s.min(t);
+            if gap > limits.epipolar_px {
+                continue;
+            }
+            let (radius_l, radius_r) = (l.major * s / fl, r.major * t / fr);
+            let ratio = radius_l / radius_r;
+            let radius = 0.5 * (radius_l + radius_r);
+            let like = |m: f64| radius < m * limits.size_factor && radius * limits.size_factor > m;
+            if ratio > limits.size_factor
+                || ratio * limits.size_factor < 1.0
+                || !gripper.marks.iter().any(|m| m.dark == l.dark && like(m.radius))
+            {
+                continue;
+            }
+            let point = StereoPoint { position: (p + q) * 0.5, radius, dark: l.dark, blob: [i as u16, j as u16] };
+            if out.push(point).is_err() {
+                return;
+            }
+        }
+    }
+}
+
+fn lift(n: Normalized) -> Vec3 {
+    Vector3::new(n.x, n.y, 1.0)
+}
+
+/// Parameters of the points of `a s` and `c + b t` that are nearest to each other; `None` for parallel rays.
+fn closest(a: &Vec3, b: &Vec3, c: &Vec3) -> Option<(f64, f64)> {
+    let (aa, bb, ab) = (a.dot(a), b.dot(b), a.dot(b));
+    let det = aa * bb - ab * ab;
+    if !(det > 1e-9 * aa * bb) {
+        return None;
+    }
+    let (ac, bc) = (a.dot(c), b.dot(c));
+    Some(((ac * bb - ab * bc) / det, (ac * ab - aa * bc) / det))
+}

@@ -1,0 +1,210 @@
+//! Acquisition from nothing: random poses among clutter, missing marks, and the cases in which the only right answer is a refusal.
+#![allow(clippy::unwrap_used)]
+
+mod support;
+
+use graspd_rt::geom::{Pose, Rig, Vec3, View, log_pose};
+use graspd_rt::gripper::{Gripper, Mark};
+use graspd_rt::image::ImageView;
+use graspd_rt::online::acquire::{
+    AcquireFailure, AcquireScratch, AcquireSettings, Acquisition, acquire, layout_is_ambiguous,
+};
+use graspd_rt::online::{VisionCycle, VisionSettings, VisionStatus};
+use support::*;
+
+fn run(rig: &Rig, gripper: &Gripper, pair: &Pair, scratch: &mut AcquireScratch) -> Result<Acquisition, AcquireFailure> {
+    let view = |b| ImageView::new(b, pair.width, pair.height, pair.width).unwrap();
+    acquire(rig, gripper, &view(&pair.left), &view(&pair.right), &AcquireSettings::default(), scratch)
+}
+
+fn scratch() -> Box<AcquireScratch> {
+    Box::new(AcquireScratch::new())
+}
+
+/// Discs in space that are no marks of ours, of the same kind and size, seen by both cameras: the worst clutter there is.
+fn clutter(random: &mut Random, n: usize) -> Gripper {
+    let mut marks = heapless::Vec::new();
+    for _ in 0..n {
+        let position =
+            Vec3::new(0.25 + random.range(-0.5, 0.5), random.range(-0.4, 0.4), 1.5 + random.range(-0.25, 0.4));
+        let normal = (Vec3::new(0.0, 0.0, -1.0) + random.direction() * 0.5).normalize();
+        let mark = Mark { position, normal, radius: random.range(0.008, 0.014), dark: random.bits() & 1 == 0 };
+        let _ = marks.push(mark);
+    }
+    Gripper { marks, flange_from_gripper: Pose::identity() }
+}
+
+/// A stereo pair of the gripper (without the hidden marks) among clutter, with a few discs in one view only.
+fn scene(
+    random: &mut Random,
+    rig: &Rig,
+    gripper: &Gripper,
+    pose: &Pose,
+    others: &Gripper,
+    hidden: &[usize],
+    blobs: usize,
+) -> Pair {
+    let look = Scene { blur: random.range(0.4, 1.2), background: random.range(90.0, 140.0), ..Default::default() };
+    let exposure = Exposure {
+        gain: random.range(0.5, 1.1),
+        offset: random.range(0.0, 20.0),
+        ramp: (random.range(-0.5, 0.5), random.range(-0.5, 0.5)),
+        noise: random.range(1.0, 4.0),
+    };
+    let mut out = View::BOTH.map(|view| {
+        let c = rig.camera(view);
+        let mut canvas = Canvas::new(c.width as usize, c.height as usize, look.background);
+        look.draw(&mut canvas, rig, view, others, &Pose::identity(), &[]);
+        for _ in 0..blobs {
+            let (u, v, r) = (random.range(20.0, 1260.0), random.range(20.0, 1000.0), random.range(4.0, 25.0));
+            canvas.fill(&circle(u, v, r), random.range(0.0, 255.0), look.blur);
+        }
+        look.draw(&mut canvas, rig, view, gripper, pose, hidden);
+        canvas.expose(&exposure, random)
+    });
+    Pair { left: std::mem::take(&mut out[0]), right: std::mem::take(&mut out[1]), width: 1280, height: 1024 }
+}
+
+fn error(truth: &Pose, found: &Pose) -> (f64, f64) {
+    let e = log_pose(&(truth.inverse() * found));
+    ((truth.translation.vector - found.translation.vector).norm() * 1e3, e.fixed_rows::<3>(3).norm().to_degrees())
+}
+
+fn many(scenes: usize, seed: u64, others: usize, blobs: usize, missing: usize) -> (usize, usize) {
+    let (rig, gripper) = (rig(true), gripper());
+    let mut scratch = scratch();
+    let mut random = Random(seed);
+    let (mut found, mut wrong) = (0, 0);
+    for n in 0..scenes {
+        let truth = pose(&mut random, 0.6);
+        let others = clutter(&mut random, others);
+        let hidden: Vec<usize> = (0..missing).map(|_| (random.bits() % 16) as usize).collect();
+        let pair = scene(&mut random, &rig, &gripper, &truth, &others, &hidden, blobs);
+        match run(&rig, &gripper, &pair, &mut scratch) {
+            Ok(a) => {
+                let (mm, deg) = error(&truth, &a.left_from_gripper);
+                if mm < 1.0 && deg < 0.5 {
+                    found += 1;
+                } else {
+                    wrong += 1;
+                    println!("scene {n}: WRONG by {mm:.1} mm {deg:.1} deg: {:?} {:.2} px", a.seen, a.residual_px);
+                }
+            }
+            Err(e) => println!("scene {n}: {e:?}, {} hidden", hidden.len()),
+        }
+    }
+    println!(
+        "{found}/{scenes} found, {wrong} wrong ({} other marks, {blobs} blobs a view, {missing} hidden)",
+        2 * others.min(32)
+    );
+    (found, wrong)
+}
+
+#[test]
+fn a_gripper_alone_is_always_found() {
+    assert_eq!(many(40, 1, 0, 0, 0), (40, 0));
+}
+
+#[test]
+fn among_tens_of_other_discs_it_is_found_and_never_wrongly() {
+    let (found, wrong) = many(120, 2, 24, 20, 2);
+    assert!(found >= 116 && wrong == 0, "{found} found, {wrong} wrong");
+}
+
+#[test]
+fn with_half_of_the_marks_hidden_it_is_mostly_found_and_never_wrongly() {
+    let (found, wrong) = many(60, 3, 16, 10, 9);
+    assert!(found >= 54 && wrong == 0, "{found} found, {wrong} wrong");
+}
+
+#[test]
+fn clutter_alone_is_not_a_gripper() {
+    let (rig, gripper) = (rig(true), gripper());
+    let mut scratch = scratch();
+    let mut random = Random(4);
+    let all: Vec<usize> = (0..16).collect();
+    for n in 0..30 {
+        let truth = pose(&mut random, 0.6);
+        let others = clutter(&mut random, 32);
+        let pair = scene(&mut random, &rig, &gripper, &truth, &others, &all, 20);
+        let a = run(&rig, &gripper, &pair, &mut scratch);
+        assert!(a.is_err(), "scene {n}: {a:?}");
+    }
+}
+
+#[test]
+fn what_is_acquired_is_tracked_at_once() {
+    let (rig, gripper) = (rig(true), gripper());
+    let mut random = Random(5);
+    let truth = pose(&mut random, 0.4);
+    let others = clutter(&mut random, 10);
+    let pair = scene(&mut random, &rig, &gripper, &truth, &others, &[], 10);
+    let a = run(&rig, &gripper, &pair, &mut scratch()).unwrap();
+    let mut cycle = VisionCycle::new(rig, gripper, VisionSettings::default());
+    cycle.seed(a.left_from_gripper);
+    let v = cycle.step(&pair.frame(1), None).unwrap();
+    assert_eq!(v.status, VisionStatus::Tracking);
+    assert!(error(&truth, &v.left_from_gripper).0 < 0.3);
+}
+
+#[test]
+fn swapped_views_blank_and_wrong_sizes_are_refused_by_name() {
+    let (rig, gripper) = (rig(true), gripper());
+    let mut random = Random(6);
+    let mut scratch = scratch();
+    let truth = pose(&mut random, 0.4);
+    let none = Gripper { marks: heapless::Vec::new(), flange_from_gripper: Pose::identity() };
+    let mut pair = scene(&mut random, &rig, &gripper, &truth, &none, &[], 0);
+    std::mem::swap(&mut pair.left, &mut pair.right);
+    assert!(run(&rig, &gripper, &pair, &mut scratch).is_err());
+    pair.left.fill(17);
+    let n = run(&rig, &gripper, &pair, &mut scratch);
+    assert!(matches!(n, Err(AcquireFailure::TooFewBlobs { found: [0, n] }) if n >= 10), "{n:?}");
+    let small = ImageView::new(&pair.left, 640, 512, 640).unwrap();
+    let settings = AcquireSettings::default();
+    let e = acquire(&rig, &gripper, &small, &small, &settings, &mut scratch);
+    assert_eq!(e.map(|a| a.seen), Err(AcquireFailure::Size(View::Left)));
+}
+
+/// Marks on a ring, evenly but for what `odd` says.
+fn ring(n: usize, odd: impl Fn(usize, &mut Mark)) -> Gripper {
+    let mut marks = heapless::Vec::new();
+    for k in 0..n {
+        let t = std::f64::consts::TAU * k as f64 / n as f64;
+        let position = Vec3::new(0.06 * t.cos(), 0.06 * t.sin(), 0.0);
+        let mut m = Mark { position, normal: -Vec3::z(), radius: 0.01, dark: true };
+        odd(k, &mut m);
+        marks.push(m).unwrap();
+    }
+    Gripper { marks, flange_from_gripper: Pose::identity() }
+}
+
+#[test]
+fn symmetric_layouts_are_named() {
+    assert!(layout_is_ambiguous(&ring(8, |_, _| {})));
+    assert!(layout_is_ambiguous(&ring(3, |_, _| {})));
+    assert!(!layout_is_ambiguous(&ring(8, |k, m| if k == 2 {
+        m.dark = false
+    })));
+    assert!(!layout_is_ambiguous(&ring(8, |k, m| if k == 2 {
+        m.position *= 0.8
+    })));
+    // A shift below what pictures tell apart is no help.
+    assert!(layout_is_ambiguous(&ring(8, |k, m| if k == 2 {
+        m.position *= 0.99
+    })));
+    assert!(layout_is_ambiguous(&ring(6, |k, m| m.position = Vec3::new(0.02 * k as f64, 0.0, 0.0))));
+    assert!(!layout_is_ambiguous(&gripper()));
+}
+
+#[test]
+fn a_symmetric_gripper_is_refused_rather_than_guessed() {
+    let rig = rig(true);
+    let gripper = ring(8, |_, _| {});
+    let mut random = Random(7);
+    let truth = pose(&mut random, 0.3);
+    let none = Gripper { marks: heapless::Vec::new(), flange_from_gripper: Pose::identity() };
+    let pair = scene(&mut random, &rig, &gripper, &truth, &none, &[], 0);
+    let a = run(&rig, &gripper, &pair, &mut scratch());
+    assert!(matches!(a, Err(AcquireFailure::Ambiguous { seen: [8, 8] })), "{a:?}");
+}
