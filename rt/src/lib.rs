@@ -7,6 +7,7 @@
 #![forbid(unsafe_code)]
 
 pub mod arm;
+pub mod cycle;
 pub mod geom;
 pub mod gripper;
 pub mod guard;

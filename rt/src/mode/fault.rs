@@ -354,6 +354,8 @@ pub enum Reject {
     Settling,
     /// A number in the request is not finite or out of range.
     BadValue,
+    /// The gripper is closed on something: open it before the arm may leave.
+    GripperClosed,
 }
 
 impl Reject {
@@ -370,6 +372,7 @@ impl Reject {
             Reject::OutOfReach => "the goal or the way to it is out of the arm's reach: move the part or the arm",
             Reject::PathLeavesView => "too few marks stay in the pictures on the way: move the arm closer or the rig",
             Reject::Settling => "wait until pictures and robot state have been good for 200 ms",
+            Reject::GripperClosed => "the gripper is closed: open it first",
             Reject::BadValue => "a value of the request is out of range",
         }
     }

@@ -12,8 +12,8 @@ pub use fault::{FaultCause, HoldCause, Reject};
 ///  ┌──────┐ ─────────────► ┌──────────┐ ─────────► ┌───────┐ ─────────► ┌──────────┐  error small   ┌───────────┐
 ///  │ Idle │                │ Tracking │            │ Armed │            │ Servoing │ ─────────────► │ Converged │
 ///  └──────┘ ◄───────────── └──────────┘ ◄───────── └───────┘            └──────────┘ ◄───────────── └───────────┘
-///     ▲      marks lost,      ▲          disarm        ▲                      │    error grew, turn,     │
-///     │      robot not ready  │                        │ hold (servo          │    retreat               │
+///     ▲      marks lost,      ▲          disarm        ▲                      │    error grew            │
+///     │      robot not ready  │                        │ hold (servo          │                          │
 ///     │                       │                        │ goes on)             ▼                          │
 ///     │                       │ stop request      ┌────┴─────────────────────────┐                       │
 ///     │ reset                 └───────────────────│ Stopping: bounded ramp, then │ ◄─────────────────────┘
@@ -32,7 +32,7 @@ pub enum Mode {
     Armed,
     /// The law drives the arm.
     Servoing,
-    /// The marks lie on the set-point; the loop stays closed and holds them there.
+    /// The marks lie on the set-point; the loop stays closed and holds them there, also while the valve is turned.
     Converged,
     /// The rates shrink to zero.
     Stopping(After),
@@ -137,8 +137,6 @@ pub enum Event {
         /// Whether the cause is gone.
         cause_gone: bool,
     },
-    /// Operator, after convergence: turn the valve or retreat with the loop closed; `Err` says what is wrong.
-    Task(Result<(), Reject>),
     /// The last leg is done and the error is small.
     Reached,
     /// The error grew again.
@@ -214,10 +212,6 @@ pub const fn step(mode: Mode, event: Event, now_ns: u64) -> (Mode, Action) {
         (Armed, Event::Servo(Err(reject))) => (mode, Action::Refuse(reject)),
         (_, Event::Servo(_)) => (mode, Action::Refuse(Reject::WrongMode)),
 
-        (Converged, Event::Task(Ok(()))) => (Servoing, Action::Begin),
-        (Converged, Event::Task(Err(reject))) => (mode, Action::Refuse(reject)),
-        (_, Event::Task(_)) => (mode, Action::Refuse(Reject::WrongMode)),
-
         (Servoing, Event::Reached) => (Converged, Action::Changed),
         (Converged, Event::Receded) => (Servoing, Action::Changed),
         (_, Event::Reached | Event::Receded) => (mode, Action::None),
@@ -241,7 +235,7 @@ mod tests {
         Mode::Stopping(After::Fault(FIRST)),
         Mode::Fault(FIRST),
     ];
-    const EVENTS: [Event; 17] = [
+    const EVENTS: [Event; 15] = [
         Event::Ready,
         Event::NotReady,
         Event::Arm(Ok(())),
@@ -252,8 +246,6 @@ mod tests {
         Event::Stop,
         Event::Reset { cause_gone: true },
         Event::Reset { cause_gone: false },
-        Event::Task(Ok(())),
-        Event::Task(Err(Reject::BadValue)),
         Event::Reached,
         Event::Receded,
         Event::AtRest,
@@ -264,15 +256,15 @@ mod tests {
     /// One letter a cell: where each pair leads. Idle, Tracking, Armed, Servoing, Converged, Stopping (t, a, f by what follows),
     /// Fault; `.` stays, `x` is refused. Columns as in `EVENTS`.
     const TABLE: [&str; 9] = [
-        "T.xxxxx.xxxx.....", // Idle
-        ".IAxxxx.xxxx.....", // Tracking
-        ".IxxTSxTxxxx....F", // Armed
-        "..xxxxxtxxxxC..af", // Servoing
-        "..xxxxxtxxSx.S.af", // Converged
-        "..xxxxx.xxxx..T.f", // Stopping, then tracking
-        "..xxxxxtxxxx..A.f", // Stopping, then armed
-        "..xxxxx.xxxx..F..", // Stopping, then fault
-        "..xxxxx.Ixxx.....", // Fault
+        "T.xxxxx.xx.....", // Idle
+        ".IAxxxx.xx.....", // Tracking
+        ".IxxTSxTxx....F", // Armed
+        "..xxxxxtxxC..af", // Servoing
+        "..xxxxxtxx.S.af", // Converged
+        "..xxxxx.xx..T.f", // Stopping, then tracking
+        "..xxxxxtxx..A.f", // Stopping, then armed
+        "..xxxxx.xx..F..", // Stopping, then fault
+        "..xxxxx.Ix.....", // Fault
     ];
 
     fn letter(m: &Mode) -> char {
@@ -320,7 +312,7 @@ mod tests {
     #[test]
     fn the_first_cause_stays_until_a_reset() {
         let mut mode = step(Mode::Servoing, Event::Fault(FaultCause::ProtectiveStop), 7).0;
-        for (k, e) in EVENTS.iter().cycle().take(170).enumerate() {
+        for (k, e) in EVENTS.iter().cycle().take(150).enumerate() {
             if matches!(e, Event::Reset { cause_gone: true }) {
                 continue;
             }

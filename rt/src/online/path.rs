@@ -193,15 +193,13 @@ pub fn blend(s: f64) -> f64 {
     s * s * (3.0 - 2.0 * s)
 }
 
-/// Reference pixel of a mark: the picture of the reference pose, drawn towards what the plan says at the goal.
+/// Reference pixel of a mark: the picture of the reference pose, and the plan's own offset carried along.
 ///
-/// `goal` is the plan's pixel and `goal_projection` the picture of the goal pose; at `s = 1`, with the reference on the goal
-/// pose, the result is `goal` itself.
-pub fn reference_pixel(projection: Pixel, goal: Option<Pixel>, goal_projection: Option<Pixel>, s: f64) -> Pixel {
-    match (goal, goal_projection) {
-        (Some(g), Some(p)) => projection + (g - p) * blend(s),
-        _ => projection,
-    }
+/// `from` and `to` are what the plan's pixels differ by from the projection of their pose at the leg's start and end; at
+/// `s = 1`, with the reference on the goal pose, the result is the plan's pixel.
+pub fn reference_pixel(projection: Pixel, from: Option<Pixel>, to: Option<Pixel>, s: f64) -> Pixel {
+    let b = blend(s);
+    projection + from.unwrap_or_default() * (1.0 - b) + to.unwrap_or_default() * b
 }
 
 #[cfg(test)]
@@ -289,10 +287,12 @@ mod tests {
 
     #[test]
     fn at_the_end_the_reference_is_the_plan() {
-        let (g, p, now) = (Pixel::new(10.0, 20.0), Pixel::new(11.5, 19.0), Pixel::new(11.5, 19.0));
-        assert_eq!(reference_pixel(now, Some(g), Some(p), 1.0), g);
-        assert_eq!(reference_pixel(now, Some(g), Some(p), 0.0), now);
-        assert_eq!(reference_pixel(now, None, Some(p), 1.0), now);
+        let (goal, projected) = (Pixel::new(10.0, 20.0), Pixel::new(11.5, 19.0));
+        let offset = Some(goal - projected);
+        assert!((reference_pixel(projected, None, offset, 1.0) - goal).norm() < 1e-12);
+        assert_eq!(reference_pixel(projected, None, offset, 0.0), projected);
+        assert!((reference_pixel(projected, offset, None, 0.0) - goal).norm() < 1e-12);
+        assert_eq!(reference_pixel(projected, None, None, 1.0), projected);
     }
 
     #[test]

@@ -1,0 +1,278 @@
+//! Watches the robot: link, safety, program, and whether the arm does what it is told.
+
+use super::io::LinkStatus;
+use super::settings::WatchSettings;
+use crate::arm::{Joints, RobotState};
+use crate::math;
+use crate::mode::FaultCause;
+
+/// Set-points remembered, to compare motion with: 64 beats cover the arm's delay at every beat rate.
+const SENT: usize = 64;
+
+/// Safety bits by meaning.
+mod bit {
+    pub(super) const REDUCED: u32 = 1 << 1;
+    pub(super) const PROTECTIVE: u32 = 1 << 2;
+    pub(super) const RECOVERY: u32 = 1 << 3;
+    pub(super) const SAFEGUARD: u32 = 1 << 4;
+    pub(super) const EMERGENCY: u32 = 1 << 5 | 1 << 6 | 1 << 7;
+    pub(super) const BROKEN: u32 = 1 << 8 | 1 << 9;
+    pub(super) const STOPPED: u32 = 1 << 10;
+}
+
+/// The robot as known now.
+#[derive(Clone, Debug)]
+pub(super) struct ArmWatch {
+    settings: WatchSettings,
+    state: Option<RobotState>,
+    link: LinkStatus,
+    echo_changed_ns: u64,
+    blocked_since_ns: Option<u64>,
+    /// What the last state showed that a later one does not: a jump, a clock that went back.
+    event: Option<FaultCause>,
+    sent: [(u64, Joints); SENT],
+    sent_at: usize,
+    moving_cmd_ns: u64,
+    off_since_ns: Option<u64>,
+    drift: Joints,
+    creeping_since_ns: Option<u64>,
+    good_since_ns: Option<u64>,
+}
+
+impl ArmWatch {
+    pub(super) fn new(settings: WatchSettings) -> Self {
+        Self {
+            settings,
+            state: None,
+            link: LinkStatus::default(),
+            echo_changed_ns: 0,
+            blocked_since_ns: None,
+            event: None,
+            sent: [(0, [0.0; 6]); SENT],
+            sent_at: 0,
+            moving_cmd_ns: 0,
+            off_since_ns: None,
+            drift: [0.0; 6],
+            creeping_since_ns: None,
+            good_since_ns: None,
+        }
+    }
+
+    /// Takes this beat's news; returns whether a new, usable state came.
+    pub(super) fn observe(&mut self, now_ns: u64, robot: Option<&RobotState>, link: LinkStatus) -> bool {
+        if link.connected && !self.link.connected {
+            // A new connection: the controller may have been restarted, nothing old is comparable.
+            self.state = None;
+            self.echo_changed_ns = now_ns;
+        }
+        self.link = link;
+        self.blocked_since_ns = match (link.blocked_sends, self.blocked_since_ns) {
+            (0, _) => None,
+            (_, None) => Some(now_ns),
+            (_, since) => since,
+        };
+        let Some(new) = robot else { return false };
+        if let Some(cause) = self.absurd(new) {
+            self.event = Some(cause);
+            return false;
+        }
+        if self.state.is_none_or(|old| old.echo != new.echo) {
+            self.echo_changed_ns = now_ns;
+        }
+        if let Some(old) = self.state {
+            self.compare_motion(now_ns, &old, new);
+        }
+        self.state = Some(*new);
+        true
+    }
+
+    /// Values that no arm can have, or cannot have after the last ones.
+    fn absurd(&self, new: &RobotState) -> Option<FaultCause> {
+        for i in 0..6 {
+            for (value, bound) in [(new.q[i], 1e3), (new.qd[i], 20.0)] {
+                if !(math::fabs(value) <= bound) {
+                    return Some(FaultCause::StateAbsurd { joint: i as u8, value });
+                }
+            }
+        }
+        for value in [new.timestamp_s, new.speed_scaling, new.target_speed_fraction] {
+            if !value.is_finite() {
+                return Some(FaultCause::StateAbsurd { joint: 6, value });
+            }
+        }
+        let old = self.state?;
+        let dt = new.timestamp_s - old.timestamp_s;
+        if dt < -1e-6 {
+            return Some(FaultCause::ClockBack { by_s: -dt });
+        }
+        for i in 0..6 {
+            let step = new.q[i] - old.q[i];
+            if math::fabs(step) > 0.02 + 7.5 * dt.min(0.5) {
+                return Some(FaultCause::StateAbsurd { joint: i as u8, value: new.q[i] });
+            }
+        }
+        None
+    }
+
+    /// Notes what was sent in this beat.
+    pub(super) fn note_sent(&mut self, now_ns: u64, rates: &Joints) {
+        self.sent_at = (self.sent_at + 1) % SENT;
+        self.sent[self.sent_at] = (now_ns, *rates);
+        if *rates != [0.0; 6] {
+            self.moving_cmd_ns = now_ns;
+        }
+    }
+
+    /// Compares measured velocities with the set-points of the last moments; whatever lies between these is no error.
+    fn compare_motion(&mut self, now_ns: u64, old: &RobotState, new: &RobotState) {
+        let dt = (new.timestamp_s - old.timestamp_s).clamp(0.0, 0.05);
+        let slow = self.slider_of(new);
+        let (mut low, mut high) = (self.sent[self.sent_at].1, self.sent[self.sent_at].1);
+        for (at, rates) in &self.sent {
+            if now_ns.saturating_sub(*at) > 60_000_000 {
+                continue;
+            }
+            for i in 0..6 {
+                // The slider may or may not have been applied to a set-point yet.
+                low[i] = low[i].min(rates[i]).min(rates[i] * slow);
+                high[i] = high[i].max(rates[i]).max(rates[i] * slow);
+            }
+        }
+        let mut off = false;
+        for i in 0..6 {
+            let error = (new.qd[i] - high[i]).max(0.0) + (new.qd[i] - low[i]).min(0.0);
+            off |= math::fabs(error) > self.settings.tracking_rad_per_s;
+            // Forgets in about a second, so that a bias of the measurement does not add up.
+            self.drift[i] = (self.drift[i] + error * dt) * (1.0 - dt);
+        }
+        self.off_since_ns = if off { self.off_since_ns.or(Some(now_ns)) } else { None };
+        let resting = now_ns.saturating_sub(self.moving_cmd_ns) > self.settings.settle_ns;
+        let creeping = new.qd.iter().any(|v| math::fabs(*v) > self.settings.uncommanded_rad_per_s);
+        self.creeping_since_ns = if resting && creeping { self.creeping_since_ns.or(Some(now_ns)) } else { None };
+    }
+
+    fn slider_of(&self, s: &RobotState) -> f64 {
+        (s.speed_scaling.clamp(0.0, 1.0) * s.target_speed_fraction.clamp(0.0, 1.0)).clamp(0.0, 1.0)
+    }
+
+    /// Share of our rates that the controller lets through, 0 to 1.
+    pub(super) fn slider(&self) -> f64 {
+        self.state.map_or(0.0, |s| self.slider_of(&s))
+    }
+
+    /// The newest usable state.
+    pub(super) fn state(&self) -> Option<&RobotState> {
+        self.state.as_ref()
+    }
+
+    /// Whether the controller is in reduced mode.
+    pub(super) fn reduced(&self) -> bool {
+        self.state.is_some_and(|s| s.safety_status_bits & bit::REDUCED != 0)
+    }
+
+    /// Age of robot state, ns.
+    pub(super) fn age_ns(&self, now_ns: u64) -> u64 {
+        self.state.map_or(u64::MAX, |s| now_ns.saturating_sub(s.received_ns))
+    }
+
+    /// What is wrong with the robot now, the plainest cause first; `None` when the arm may be driven.
+    ///
+    /// `watched` adds what only matters while we claim the arm: whether it follows, and rests when told to.
+    pub(super) fn fault(&self, now_ns: u64, watched: bool) -> Option<FaultCause> {
+        let w = &self.settings;
+        if let Some(s) = &self.state {
+            let bits = s.safety_status_bits;
+            let safety = [
+                (bit::EMERGENCY, FaultCause::EmergencyStop),
+                (bit::BROKEN | bit::RECOVERY, FaultCause::SafetyFault { bits }),
+                (bit::PROTECTIVE, FaultCause::ProtectiveStop),
+                (bit::SAFEGUARD, FaultCause::SafeguardStop),
+                (bit::STOPPED, FaultCause::SafetyFault { bits }),
+            ];
+            if let Some((_, cause)) = safety.into_iter().find(|(mask, _)| bits & mask != 0) {
+                return Some(cause);
+            }
+        }
+        if !self.link.connected {
+            return Some(FaultCause::LinkLost);
+        }
+        if self.event.is_some() {
+            return self.event;
+        }
+        let Some(s) = &self.state else {
+            return Some(FaultCause::StateStale { age_ns: u64::MAX, limit_ns: w.state_age_ns });
+        };
+        let age_ns = now_ns.saturating_sub(s.received_ns);
+        if age_ns > w.state_age_ns {
+            return Some(FaultCause::StateStale { age_ns, limit_ns: w.state_age_ns });
+        }
+        if s.robot_mode != 7 {
+            return Some(FaultCause::NotRunning { mode: s.robot_mode });
+        }
+        if s.script_fault != 0 {
+            return Some(FaultCause::ScriptFault { word: s.script_fault });
+        }
+        if s.runtime_state != 2 {
+            return Some(FaultCause::ProgramStopped { runtime_state: s.runtime_state });
+        }
+        if self.link.token != 0 && s.script_token != self.link.token {
+            return Some(FaultCause::TokenChanged { expected: self.link.token, found: s.script_token });
+        }
+        let still = now_ns.saturating_sub(self.echo_changed_ns);
+        if still > w.echo_ns {
+            return Some(FaultCause::EchoStopped { for_ns: still });
+        }
+        if self.blocked_since_ns.is_some_and(|t| now_ns.saturating_sub(t) >= w.blocked_ns) {
+            return Some(FaultCause::SendBlocked { count: self.link.blocked_sends });
+        }
+        if watched { self.disobedience(now_ns, s) } else { None }
+    }
+
+    fn disobedience(&self, now_ns: u64, s: &RobotState) -> Option<FaultCause> {
+        let w = &self.settings;
+        let since = |t: Option<u64>, limit: u64| t.is_some_and(|t| now_ns.saturating_sub(t) >= limit);
+        let worst = |v: &Joints| (0..6).fold(0, |m, i| if math::fabs(v[i]) > math::fabs(v[m]) { i } else { m });
+        if since(self.creeping_since_ns, w.uncommanded_ns) {
+            let joint = worst(&s.qd);
+            return Some(FaultCause::Uncommanded { joint: joint as u8, velocity: s.qd[joint] });
+        }
+        let joint = worst(&self.drift);
+        if since(self.off_since_ns, w.tracking_ns) || math::fabs(self.drift[joint]) > w.tracking_rad {
+            let error: Joints = core::array::from_fn(|i| s.qd[i] - self.sent[self.sent_at].1[i]);
+            let joint = if math::fabs(self.drift[joint]) > w.tracking_rad { joint } else { worst(&error) };
+            return Some(FaultCause::TrackingError {
+                joint: joint as u8,
+                velocity: error[joint],
+                position: self.drift[joint],
+            });
+        }
+        None
+    }
+
+    /// Whether the arm has been fit to be driven for `good_ns`. To be called once a beat.
+    pub(super) fn note_good(&mut self, now_ns: u64, watched: bool) {
+        self.good_since_ns =
+            if self.fault(now_ns, watched).is_none() { self.good_since_ns.or(Some(now_ns)) } else { None };
+    }
+
+    /// Since when the robot has been fit to be driven.
+    pub(super) fn good_for_ns(&self, now_ns: u64) -> Option<u64> {
+        self.good_since_ns.map(|t| now_ns.saturating_sub(t))
+    }
+
+    /// Forgets what a reset may forget: events of the past, not conditions of the present.
+    pub(super) fn clear_events(&mut self) {
+        self.event = None;
+        self.state = None;
+        self.drift = [0.0; 6];
+        self.off_since_ns = None;
+        self.creeping_since_ns = None;
+    }
+
+    /// What would still be wrong after a reset.
+    pub(super) fn lasting_fault(&self, now_ns: u64) -> Option<FaultCause> {
+        let mut after = self.clone();
+        after.event = None;
+        after.fault(now_ns, false)
+    }
+}

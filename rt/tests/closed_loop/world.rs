@@ -1,0 +1,358 @@
+//! A world in lock step: an arm that is not quite the model, a rig placed at random, marks as points.
+
+use graspd_rt::arm::{ArmCommand, ArmMode, Dh, Joints, Model, READY, RobotState};
+use graspd_rt::cycle::{
+    CommandCycle, CommandInput, CommandOutput, CycleConfig, CycleSettings, LinkStatus, Request, RequestKind,
+};
+use graspd_rt::geom::{Camera, Distortion, Pose, Rig, Twist, Vec3, View, exp_twist, log_pose};
+use graspd_rt::gripper::{Gripper, MAX_MARKS, Mark};
+use graspd_rt::online::{MarkObservation, Vision, VisionStatus};
+use graspd_rt::setpoint::{Goal, SetPoint};
+use nalgebra::{Matrix2, Matrix6};
+use std::collections::VecDeque;
+
+/// SplitMix64: a seed reproduces a run on every platform.
+pub(crate) struct Rng(pub(crate) u64);
+
+impl Rng {
+    pub(crate) fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+    /// Even in -m..m.
+    pub(crate) fn even(&mut self, m: f64) -> f64 {
+        ((self.next() >> 11) as f64 / (1_u64 << 52) as f64 - 1.0) * m
+    }
+    /// Normal with deviation `s`.
+    pub(crate) fn normal(&mut self, s: f64) -> f64 {
+        let mut t = 0.0;
+        for _ in 0..12 {
+            t += self.even(0.5);
+        }
+        t * s
+    }
+}
+
+pub(crate) const MS: u64 = 1_000_000;
+
+/// What the world does wrong on request.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Faults {
+    pub(crate) no_vision: bool,
+    pub(crate) frozen_vision: bool,
+    pub(crate) lost_marks: bool,
+    pub(crate) no_state: bool,
+    pub(crate) link_down: bool,
+    pub(crate) echo_stuck: bool,
+    pub(crate) safety_bits: Option<u32>,
+    pub(crate) robot_mode: Option<i32>,
+    pub(crate) runtime: Option<u32>,
+    pub(crate) nan_state: bool,
+    pub(crate) jump_state: bool,
+    pub(crate) clock_back: bool,
+    pub(crate) token: bool,
+    pub(crate) stuck_arm: bool,
+    pub(crate) drift_arm: bool,
+    pub(crate) nan_marks: bool,
+    pub(crate) jump_marks: bool,
+    pub(crate) stall: bool,
+    pub(crate) slider_zero: bool,
+}
+
+pub(crate) struct World {
+    pub(crate) rng: Rng,
+    pub(crate) now: u64,
+    pub(crate) period: u64,
+    pub(crate) frame_period: u64,
+    pub(crate) cycle: CommandCycle,
+    pub(crate) config: CycleConfig,
+    pub(crate) true_dh: Dh,
+    pub(crate) true_rig: Rig,
+    pub(crate) base_from_left: Pose,
+    pub(crate) q: Joints,
+    pub(crate) qd: Joints,
+    /// Multiplies what the arm does with its rates: -1 is an arm wired the wrong way.
+    pub(crate) sense: f64,
+    pub(crate) setpoint: SetPoint,
+    pub(crate) faults: Faults,
+    pub(crate) slider: f64,
+    pub(crate) noise_px: f64,
+    pipeline: VecDeque<(u64, Vision)>,
+    next_capture: u64,
+    sequence: u64,
+    last_vision: Option<Vision>,
+    pending: ArmCommand,
+    pub(crate) sent: Vec<(u64, Joints)>,
+    pub(crate) outputs: u32,
+}
+
+fn gripper() -> Gripper {
+    let mut marks = heapless::Vec::new();
+    for k in 0..8 {
+        let a = f64::from(k) * 0.785;
+        let position = Vec3::new(0.05 * a.cos(), 0.03 + 0.015 * f64::from(k % 3), -0.06 + 0.05 * a.sin());
+        marks.push(Mark { position, normal: Vec3::y(), radius: 0.006, dark: true }).unwrap();
+    }
+    Gripper { marks, flange_from_gripper: exp_twist(&Twist::new(0.0, 0.01, 0.16, 0.0, 0.0, 0.3)) }
+}
+
+fn camera(k: f64) -> Camera {
+    let distortion = Distortion { k1: -0.12, k2: 0.05, p1: 2e-4 * k, ..Default::default() };
+    Camera { width: 1280, height: 1024, fx: 1200.0 + 3.0 * k, fy: 1199.0, cx: 640.0 - k, cy: 512.0 + k, distortion }
+}
+
+impl World {
+    pub(crate) fn new(seed: u64, tune: impl Fn(&mut CycleSettings)) -> Self {
+        let mut rng = Rng(seed.wrapping_mul(77).wrapping_add(5));
+        let model = [Model::Ur5e, Model::Ur10e, Model::Ur5, Model::Ur3e][(seed % 4) as usize];
+        let dh = Dh::nominal(model);
+        // Half a millimetre and a tenth of a degree on every link.
+        let mut small = |m: f64| -> [f64; 6] { std::array::from_fn(|_| rng.even(m)) };
+        let angle = 0.1_f64.to_radians();
+        let delta = Dh { a: small(5e-4), d: small(5e-4), alpha: small(angle), theta: small(angle) };
+        let true_dh = dh.plus(&delta);
+        let gripper = gripper();
+        let q_goal: Joints = std::array::from_fn(|i| READY[i] + rng.even(0.25));
+        let turned = exp_twist(&Twist::new(0.0, 0.0, 0.0, rng.even(0.35), rng.even(0.8), rng.even(0.35)));
+        // The marks' side (y of the gripper) towards the cameras.
+        let facing = exp_twist(&Twist::new(0.0, 0.0, 0.0, -std::f64::consts::FRAC_PI_2, 0.0, 0.0));
+        let goal = Pose::translation(0.2 + rng.even(0.05), rng.even(0.05), 1.45 + rng.even(0.1)) * turned * facing;
+        let base_from_left = true_dh.base_from_gripper(&q_goal, &gripper.flange_from_gripper) * goal.inverse();
+        let right_from_left = exp_twist(&Twist::new(-0.48, 0.01, 0.06, 0.01, 0.3 + rng.even(0.03), -0.01));
+        let rig = Rig { left: camera(1.0), right: camera(-2.0), right_from_left };
+        let mut settings = CycleSettings::default();
+        tune(&mut settings);
+        let config = CycleConfig { model, dh, rig, gripper, settings };
+        let pregrasp = goal * Pose::translation(0.0, 0.0, -0.07);
+        let setpoint = SetPoint {
+            id: seed + 1,
+            pregrasp: plan(&config, pregrasp),
+            grasp: plan(&config, goal),
+            object_centre: goal.translation.vector,
+            object_normal: goal.rotation * -Vec3::z(),
+            best_view: View::Left,
+        };
+        let q = std::array::from_fn(|i| q_goal[i] + rng.even(0.12));
+        let period = config.settings.period_ns;
+        let frame_period = config.settings.frame_period_ns;
+        Self {
+            rng,
+            now: 10_000 * MS,
+            period,
+            frame_period,
+            cycle: CommandCycle::new(config.clone()).unwrap(),
+            true_rig: config.rig,
+            config,
+            true_dh,
+            base_from_left,
+            q,
+            qd: [0.0; 6],
+            sense: 1.0,
+            setpoint,
+            faults: Faults::default(),
+            slider: 1.0,
+            noise_px: 0.1,
+            pipeline: VecDeque::new(),
+            next_capture: 10_000 * MS,
+            sequence: 0,
+            last_vision: None,
+            pending: ArmCommand::default(),
+            sent: Vec::new(),
+            outputs: 0,
+        }
+    }
+
+    pub(crate) fn left_from_gripper(&self) -> Pose {
+        self.base_from_left.inverse()
+            * self.true_dh.base_from_gripper(&self.q, &self.config.gripper.flange_from_gripper)
+    }
+
+    /// True distance (mm) and angle (degrees) to a pose.
+    pub(crate) fn error_to(&self, goal: &Pose) -> (f64, f64) {
+        let p = self.left_from_gripper();
+        let d = (p.translation.vector - goal.translation.vector).norm() * 1e3;
+        (d, log_pose(&(p.inverse() * goal)).fixed_rows::<3>(3).norm().to_degrees())
+    }
+
+    fn picture(&mut self) -> Vision {
+        let pose = self.left_from_gripper();
+        let mut marks = [[None; MAX_MARKS]; 2];
+        let mut seen = [0; 2];
+        for view in View::BOTH {
+            for i in 0..self.config.gripper.marks.len() {
+                let x = pose * nalgebra::Point3::from(self.config.gripper.marks[i].position);
+                let Some(p) = self.true_rig.project(view, &x.coords) else { continue };
+                if !self.true_rig.camera(view).contains(p, 6.0) {
+                    continue;
+                }
+                let n = nalgebra::Vector2::new(self.rng.normal(self.noise_px), self.rng.normal(self.noise_px));
+                marks[view.index()][i] = Some(MarkObservation {
+                    pixel: p + n,
+                    covariance: Matrix2::identity() * self.noise_px * self.noise_px,
+                    quality: 1.0,
+                });
+                seen[view.index()] += 1;
+            }
+        }
+        let e = Twist::from_fn(|i, _| self.rng.normal(if i < 3 { 1e-4 } else { 4e-4 }));
+        self.sequence += 1;
+        Vision {
+            sequence: self.sequence,
+            capture_ns: [self.now; 2],
+            status: VisionStatus::Tracking,
+            marks,
+            seen,
+            left_from_gripper: pose * exp_twist(&e),
+            covariance: Matrix6::identity() * 1e-8,
+            residual_px: self.noise_px,
+        }
+    }
+
+    fn state(&mut self, beat: i32) -> RobotState {
+        let f = self.faults;
+        let mut s = RobotState {
+            timestamp_s: self.now as f64 * 1e-9,
+            received_ns: self.now,
+            q: self.q,
+            qd: self.qd,
+            target_q: self.q,
+            target_qd: self.qd,
+            robot_mode: f.robot_mode.unwrap_or(7),
+            safety_status_bits: f.safety_bits.unwrap_or(1),
+            robot_status_bits: 3,
+            runtime_state: f.runtime.unwrap_or(2),
+            speed_scaling: 1.0,
+            target_speed_fraction: if f.slider_zero { 0.0 } else { self.slider },
+            digital_outputs: 0,
+            echo: if f.echo_stuck { 12345 } else { beat },
+            script_state: 1,
+            script_fault: 0,
+            script_token: if f.token { 99 } else { 42 },
+        };
+        if f.nan_state {
+            s.q[3] = f64::NAN;
+        }
+        if f.jump_state {
+            s.q[2] += 0.3;
+        }
+        if f.clock_back {
+            s.timestamp_s -= 100.0;
+        }
+        s
+    }
+
+    /// One beat with an optional request.
+    pub(crate) fn beat(&mut self, request: Option<RequestKind>, offer: bool) -> CommandOutput {
+        let dt = self.period as f64 * 1e-9;
+        self.now += if self.faults.stall { 30 * MS } else { self.period };
+        // The arm: last beat's set-point, through a first-order lag.
+        let mut target = if self.pending.mode == ArmMode::Velocity { self.pending.rates } else { [0.0; 6] };
+        let slider = if self.faults.slider_zero { 0.0 } else { self.slider };
+        if self.faults.stuck_arm {
+            target = [0.0; 6];
+        }
+        for i in 0..6 {
+            let mut wish = target[i] * slider * self.sense;
+            if self.faults.drift_arm {
+                wish += 0.03;
+            }
+            self.qd[i] += (wish - self.qd[i]) * (dt / 0.02).min(1.0);
+            self.q[i] += self.qd[i] * dt;
+        }
+        while self.now >= self.next_capture {
+            self.next_capture += self.frame_period;
+            let v = self.picture();
+            if !self.faults.no_vision {
+                self.pipeline.push_back((self.now + 30 * MS, v));
+            }
+        }
+        let mut vision = None;
+        while self.pipeline.front().is_some_and(|(t, _)| *t <= self.now) {
+            vision = self.pipeline.pop_front().map(|(_, v)| v);
+        }
+        if let Some(v) = &mut vision {
+            if self.faults.frozen_vision {
+                if let Some(old) = &self.last_vision {
+                    let (sequence, capture_ns) = (v.sequence, v.capture_ns);
+                    *v = Vision { sequence, capture_ns, ..*old };
+                }
+            }
+            if self.faults.lost_marks {
+                v.status = VisionStatus::Lost;
+                v.marks = [[None; MAX_MARKS]; 2];
+            }
+            if self.faults.nan_marks {
+                for m in v.marks.iter_mut().flatten().flatten() {
+                    m.pixel.x = f64::NAN;
+                }
+            }
+            if self.faults.jump_marks {
+                v.left_from_gripper.translation.vector.x += 0.05;
+                for m in v.marks.iter_mut().flatten().flatten() {
+                    m.pixel.x += 40.0;
+                }
+            }
+            self.last_vision = Some(*v);
+        }
+        let beat = self.pending.beat;
+        let state = self.state(beat);
+        let output = self.cycle.step(&CommandInput {
+            now_ns: self.now,
+            robot: (!self.faults.no_state && !self.faults.link_down).then_some(state),
+            link: LinkStatus { connected: !self.faults.link_down, token: 42, blocked_sends: 0 },
+            vision: vision.as_ref(),
+            request: request.map(|kind| Request { id: 1, kind }),
+            setpoint: offer.then_some(&self.setpoint),
+            internal_fault: false,
+        });
+        self.pending = output.command;
+        self.outputs = output.command.outputs;
+        self.sent.push((self.now, output.command.rates));
+        output
+    }
+
+    pub(crate) fn run(&mut self, ms: u64) -> CommandOutput {
+        let end = self.now + ms * MS;
+        let mut out = self.beat(None, false);
+        while self.now < end {
+            out = self.beat(None, false);
+        }
+        out
+    }
+
+    /// Offers the set-point, arms and starts; panics with the reason if refused.
+    pub(crate) fn start(&mut self) {
+        self.run(500);
+        assert_eq!(self.beat(None, true).setpoint_reply, Some(Ok(())));
+        assert_eq!(self.beat(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()));
+        assert_eq!(self.beat(Some(RequestKind::Servo), false).reply.unwrap().result, Ok(()));
+    }
+
+    /// The oracle: every set-point ever sent, finite, within speed, acceleration and position limits.
+    pub(crate) fn judge_wire(&self) {
+        let l = self.cycle.limits();
+        let (v, a) = (l.velocity(), l.acceleration());
+        for pair in self.sent.windows(2) {
+            let dt = ((pair[1].0 - pair[0].0) as f64 * 1e-9).min(self.period as f64 * 1e-9);
+            for i in 0..6 {
+                let (x, y) = (pair[0].1[i], pair[1].1[i]);
+                assert!(y.is_finite() && y.abs() <= v[i] * (1.0 + 1e-9), "joint {i} at {y}");
+                assert!((y - x).abs() <= a * dt * (1.0 + 1e-9), "joint {i}: {x} to {y} in {dt}");
+            }
+        }
+    }
+}
+
+fn plan(c: &CycleConfig, pose: Pose) -> Goal {
+    let mut marks = [[None; MAX_MARKS]; 2];
+    for view in View::BOTH {
+        for (i, m) in c.gripper.marks.iter().enumerate() {
+            let x = pose * nalgebra::Point3::from(m.position);
+            marks[view.index()][i] = c.rig.project(view, &x.coords).filter(|p| c.rig.camera(view).contains(*p, 0.0));
+        }
+    }
+    Goal { left_from_gripper: pose, marks }
+}
