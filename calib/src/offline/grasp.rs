@@ -38,7 +38,9 @@ impl Default for Approach {
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum GraspError {
     /// The jaws cannot take the object.
-    #[error("the object is {needed_mm:.1} mm wide with clearance, but the jaws open from {min_mm:.1} to {max_mm:.1} mm: use another gripper, or another contour of the part")]
+    #[error(
+        "the object is {needed_mm:.1} mm wide with clearance, but the jaws open from {min_mm:.1} to {max_mm:.1} mm: use another gripper, or another contour of the part"
+    )]
     Opening {
         /// Narrowest side of the object with clearance, millimetres.
         needed_mm: f64,
@@ -48,7 +50,9 @@ pub enum GraspError {
         max_mm: f64,
     },
     /// Too few marks are visible at every candidate.
-    #[error("at every possible grasp too few of the {marks} marks can be seen (best: {left} left, {right} right; {LEAST_MARKS} are needed in one view): move the rig, or place the marks so that they face it")]
+    #[error(
+        "at every possible grasp too few of the {marks} marks can be seen (best: {left} left, {right} right; {LEAST_MARKS} are needed in one view): move the rig, or place the marks so that they face it"
+    )]
     MarksHidden {
         /// Marks on the gripper.
         marks: usize,
@@ -58,7 +62,9 @@ pub enum GraspError {
         right: usize,
     },
     /// The present pose forbids every candidate.
-    #[error("every grasp that shows the marks asks for a turn of more than {limit_deg:.0} degrees from the present pose (smallest: {smallest_deg:.0}): turn the gripper first, or allow more")]
+    #[error(
+        "every grasp that shows the marks asks for a turn of more than {limit_deg:.0} degrees from the present pose (smallest: {smallest_deg:.0}): turn the gripper first, or allow more"
+    )]
     Turn {
         /// The limit, degrees.
         limit_deg: f64,
@@ -130,7 +136,12 @@ pub fn object_frame(r: &Reconstruction) -> Pose {
 }
 
 /// Chooses the grasp on a reconstructed rim.
-pub fn choose(rig: &Rig, gripper: &GripperFile, object: &Reconstruction, approach: &Approach) -> Result<Grasp, GraspError> {
+pub fn choose(
+    rig: &Rig,
+    gripper: &GripperFile,
+    object: &Reconstruction,
+    approach: &Approach,
+) -> Result<Grasp, GraspError> {
     let (half_a, half_b) = object.half_widths();
     let obstacle = RimObstacle { centre: object.rim.centre, normal: object.rim.normal, radius: half_a };
     let [min, max] = gripper.opening;
@@ -140,7 +151,11 @@ pub fn choose(rig: &Rig, gripper: &GripperFile, object: &Reconstruction, approac
         return Err(GraspError::Opening { needed_mm: needed(half_b) * 1e3, min_mm: min * 1e3, max_mm: max * 1e3 });
     }
     let finder = Finder { rig, gripper, rim: &object.rim, obstacle: &obstacle, approach };
-    if object.is_round() { finder.circle(needed(half_a)) } else { finder.ellipse(needed(half_a), needed(half_b), &fits, half_a, half_b) }
+    if object.is_round() {
+        finder.circle(needed(half_a))
+    } else {
+        finder.ellipse(needed(half_a), needed(half_b), &fits, half_a, half_b)
+    }
 }
 
 struct Finder<'a> {
@@ -198,8 +213,9 @@ impl Finder<'_> {
             let (x, y) = (rank(a, v), rank(b, v));
             x.0.cmp(&y.0).then(x.1.cmp(&y.1)).then(x.2.total_cmp(&y.2)).then(b.angle.total_cmp(&a.angle))
         };
-        let best: Vec<Option<&Place>> =
-            (0..2).map(|v| grid.iter().filter(allowed).filter(|p| p.worth(v) > 0.0).max_by(|a, b| better(a, b, v))).collect();
+        let best: Vec<Option<&Place>> = (0..2)
+            .map(|v| grid.iter().filter(allowed).filter(|p| p.worth(v) > 0.0).max_by(|a, b| better(a, b, v)))
+            .collect();
         let view = match (best.first().copied().flatten(), best.get(1).copied().flatten()) {
             (None, None) => return Err(self.hidden(&grid)),
             (Some(_), None) => 0,
@@ -234,7 +250,9 @@ impl Finder<'_> {
         let mut candidates = vec![chosen.record("chosen".to_owned(), 0.0)];
         for (v, b) in best.iter().enumerate() {
             if let Some(b) = b.filter(|_| v != view) {
-                candidates.push(b.record(format!("possible: best for the {} camera", if v == 0 { "left" } else { "right" }), 0.0));
+                candidates.push(
+                    b.record(format!("possible: best for the {} camera", if v == 0 { "left" } else { "right" }), 0.0),
+                );
             }
         }
         if let Some(worst) = grid.iter().min_by(|a, b| a.worth(view).total_cmp(&b.worth(view))) {
@@ -260,7 +278,14 @@ impl Finder<'_> {
     }
 
     /// The four positions on an ellipse.
-    fn ellipse(&self, open_a: f64, open_b: f64, fits: &dyn Fn(f64) -> bool, half_a: f64, half_b: f64) -> Result<Grasp, GraspError> {
+    fn ellipse(
+        &self,
+        open_a: f64,
+        open_b: f64,
+        fits: &dyn Fn(f64) -> bool,
+        half_a: f64,
+        half_b: f64,
+    ) -> Result<Grasp, GraspError> {
         let e1: Vec3 = direction(self.rim, 0.0);
         let e2: Vec3 = direction(self.rim, 0.5 * PI);
         let origin = self.rim.axis_a.dot(&e2).atan2(self.rim.axis_a.dot(&e1));
@@ -330,6 +355,15 @@ impl Finder<'_> {
             }
         }
         let best_view = if view == 0 { View::Left } else { View::Right };
-        Grasp { handle, pregrasp: p.pregrasp, grasp: p.grasp, opening: p.opening, best_view, flatness, warnings, candidates }
+        Grasp {
+            handle,
+            pregrasp: p.pregrasp,
+            grasp: p.grasp,
+            opening: p.opening,
+            best_view,
+            flatness,
+            warnings,
+            candidates,
+        }
     }
 }

@@ -105,7 +105,8 @@ impl<'a> Scene<'a> {
         for d in [Vec3::zeros(), e1, -e1, e2, -e2] {
             let p = mark.position + d;
             let length = (eye_in_gripper - p).norm();
-            if self.boxes.iter().filter_map(|b| b.cut(&p, eye_in_gripper)).any(|(t0, t1)| (t1 - t0) * length > GRAZE_M) {
+            if self.boxes.iter().filter_map(|b| b.cut(&p, eye_in_gripper)).any(|(t0, t1)| (t1 - t0) * length > GRAZE_M)
+            {
                 return None;
             }
             if self.obstacle.is_some_and(|o| o.blocks(&(pose * Point3::from(p)).coords, eye)) {
