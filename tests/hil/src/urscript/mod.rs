@@ -7,8 +7,19 @@
 //! Rules of the language come from UR's script manual and the behaviour of UR's and SDU's published scripts. Where a robot's
 //! behaviour is not documented, the stricter reading is taken, so that a script which runs here has a better chance there.
 
+mod arithmetic;
+mod ast;
+mod builtins;
+mod compile;
 mod error;
+mod expression;
 mod host;
+mod lexer;
+mod machine;
+mod parser;
+mod pure;
+mod signature;
+mod sockets;
 mod value;
 
 pub use error::{HostError, RuntimeError, ScriptError};
@@ -16,4 +27,5 @@ pub use host::{
     Bank, Connect, Host, JOINTS, JointVector, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup, PoseVector,
     Received, RobotView, StepOutcome, Target, WatchdogAction,
 };
+pub use machine::{MAX_CALL_DEPTH, MAX_INSTRUCTIONS, MAX_THREADS, Machine, ProgramKind};
 pub use value::Value;

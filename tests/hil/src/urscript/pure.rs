@@ -1,0 +1,244 @@
+//! Built-in functions that need nothing but their arguments.
+
+use super::arithmetic::{Outcome, whole};
+use super::value::Value;
+use nalgebra::{Isometry3, Rotation3, Translation3, UnitQuaternion, Vector3};
+
+/// Longest text that a script may build.
+pub(crate) const MAX_TEXT: usize = 16_384;
+
+pub(crate) fn number(v: &Value) -> Outcome<f64> {
+    v.as_f64().ok_or_else(|| format!("a number is needed, this is {}", v.type_name()))
+}
+
+/// A number that is finite; a robot never moves by NaN.
+pub(crate) fn finite(v: &Value) -> Outcome<f64> {
+    let x = number(v)?;
+    if x.is_finite() { Ok(x) } else { Err(format!("a finite number is needed, this is {x}")) }
+}
+
+pub(crate) fn six(v: &Value) -> Outcome<[f64; 6]> {
+    let values = v.as_six().ok_or_else(|| format!("six numbers are needed, this is {} ({v})", v.type_name()))?;
+    if values.iter().all(|x| x.is_finite()) { Ok(values) } else { Err(format!("six finite numbers are needed: {v}")) }
+}
+
+pub(crate) fn pose(v: &Value) -> Outcome<[f64; 6]> {
+    match v {
+        Value::Pose(_) => six(v),
+        _ => Err(format!("a pose p[...] is needed, this is {}", v.type_name())),
+    }
+}
+
+pub(crate) fn text(v: &Value) -> Outcome<&str> {
+    match v {
+        Value::Str(s) => Ok(s),
+        _ => Err(format!("a string is needed, this is {}", v.type_name())),
+    }
+}
+
+pub(crate) fn boolean(v: &Value) -> Outcome<bool> {
+    match v {
+        Value::Bool(b) => Ok(*b),
+        _ => Err(format!("a boolean is needed, this is {}", v.type_name())),
+    }
+}
+
+/// A whole number from 0 below `limit`.
+pub(crate) fn index(v: &Value, limit: usize) -> Outcome<usize> {
+    whole(v)
+        .and_then(|i| usize::try_from(i).ok())
+        .filter(|i| *i < limit)
+        .ok_or_else(|| format!("a whole number from 0 to {} is needed, this is {v}", limit - 1))
+}
+
+pub(crate) fn int32(v: &Value) -> Outcome<i32> {
+    whole(v)
+        .and_then(|i| i32::try_from(i).ok())
+        .ok_or_else(|| format!("a 32-bit whole number is needed, this is {} ({v})", v.type_name()))
+}
+
+fn isometry(p: &[f64; 6]) -> Isometry3<f64> {
+    let [x, y, z, rx, ry, rz] = *p;
+    Isometry3::from_parts(Translation3::new(x, y, z), UnitQuaternion::from_scaled_axis(Vector3::new(rx, ry, rz)))
+}
+
+fn from_isometry(i: &Isometry3<f64>) -> Value {
+    let (t, r) = (i.translation.vector, i.rotation.scaled_axis());
+    Value::Pose([t.x, t.y, t.z, r.x, r.y, r.z])
+}
+
+fn frame(v: &Value) -> Outcome<Isometry3<f64>> {
+    Ok(isometry(&pose(v)?))
+}
+
+fn three(v: &Value) -> Outcome<Vector3<f64>> {
+    match v {
+        Value::List(items) => match items.as_slice() {
+            [x, y, z] => Ok(Vector3::new(number(x)?, number(y)?, number(z)?)),
+            _ => Err(format!("three numbers are needed, here are {}", items.len())),
+        },
+        Value::Pose(p) => Ok(Vector3::new(p[0], p[1], p[2])),
+        _ => Err(format!("three numbers are needed, this is {}", v.type_name())),
+    }
+}
+
+fn list(v: &Value) -> Outcome<Vec<f64>> {
+    match v {
+        Value::List(items) => items.iter().map(number).collect(),
+        Value::Pose(p) => Ok(p.to_vec()),
+        _ => Err(format!("a list is needed, this is {}", v.type_name())),
+    }
+}
+
+fn domain(function: &str, x: f64) -> Outcome {
+    if x.is_finite() { Ok(Value::Float(x)) } else { Err(format!("{function}: the argument is outside its domain")) }
+}
+
+fn rounded(x: f64) -> Outcome {
+    if x.abs() <= f64::from(i32::MAX) { Ok(Value::Int(x as i32)) } else { Err(format!("{x} does not fit 32 bits")) }
+}
+
+/// Calls a pure built-in; `None` if `name` is not one. Arguments are bound already.
+pub(crate) fn call(name: &str, a: &[Value]) -> Option<Outcome> {
+    let none = Value::None;
+    let [x, y, z] = [0, 1, 2].map(|i| a.get(i).unwrap_or(&none));
+    Some(match name {
+        "sin" => number(x).map(|x| Value::Float(x.sin())),
+        "cos" => number(x).map(|x| Value::Float(x.cos())),
+        "tan" => number(x).map(|x| Value::Float(x.tan())),
+        "asin" => number(x).and_then(|x| domain(name, x.asin())),
+        "acos" => number(x).and_then(|x| domain(name, x.acos())),
+        "atan" => number(x).map(|x| Value::Float(x.atan())),
+        "atan2" => number(x).and_then(|x| Ok(Value::Float(x.atan2(number(y)?)))),
+        "sqrt" => number(x).and_then(|x| domain(name, x.sqrt())),
+        "pow" => number(x).and_then(|x| domain(name, x.powf(number(y)?))),
+        "log" => number(x).and_then(|b| domain(name, number(y)?.log(b))),
+        "floor" => number(x).and_then(|x| rounded(x.floor())),
+        "ceil" => number(x).and_then(|x| rounded(x.ceil())),
+        "d2r" => number(x).map(|x| Value::Float(x.to_radians())),
+        "r2d" => number(x).map(|x| Value::Float(x.to_degrees())),
+        "norm" => norm(x),
+        "normalize" => normalize(x),
+        "length" | "get_list_length" | "size" => count(x),
+        "transpose" => transpose(x),
+        "binary_list_to_integer" => bits_to_integer(x),
+        "integer_to_binary_list" => {
+            int32(x).map(|i| Value::List((0..32).map(|b| Value::Bool((i >> b) & 1 == 1)).collect()))
+        }
+        "pose_trans" => frame(x).and_then(|p| Ok(from_isometry(&(p * frame(y)?)))),
+        "pose_inv" => frame(x).map(|p| from_isometry(&p.inverse())),
+        "pose_add" => frame(x).and_then(|p| {
+            let q = frame(y)?;
+            let t = Translation3::from(p.translation.vector + q.translation.vector);
+            Ok(from_isometry(&Isometry3::from_parts(t, p.rotation * q.rotation)))
+        }),
+        "pose_sub" => frame(x).and_then(|to| {
+            let from = frame(y)?;
+            let t = Translation3::from(to.translation.vector - from.translation.vector);
+            Ok(from_isometry(&Isometry3::from_parts(t, to.rotation * from.rotation.inverse())))
+        }),
+        "pose_dist" | "point_dist" => three(x).and_then(|p| Ok(Value::Float((three(y)? - p).norm()))),
+        "interpolate_pose" => frame(x).and_then(|from| {
+            let (to, s) = (frame(y)?, finite(z)?);
+            let t = from.translation.vector.lerp(&to.translation.vector, s);
+            let turn = (from.rotation.inverse() * to.rotation).scaled_axis() * s;
+            let rotation = from.rotation * UnitQuaternion::from_scaled_axis(turn);
+            Ok(from_isometry(&Isometry3::from_parts(Translation3::from(t), rotation)))
+        }),
+        "rotvec2rpy" => three(x).map(|r| {
+            let (roll, pitch, yaw) = Rotation3::from_scaled_axis(r).euler_angles();
+            Value::floats(&[roll, pitch, yaw])
+        }),
+        "rpy2rotvec" => three(x).map(|r| {
+            let v = Rotation3::from_euler_angles(r.x, r.y, r.z).scaled_axis();
+            Value::floats(&[v.x, v.y, v.z])
+        }),
+        "to_str" => Ok(Value::Str(x.to_string())),
+        "to_num" => text(x).and_then(to_number),
+        "str_cat" => concatenate(x, y),
+        "str_len" => text(x).map(|s| Value::Int(i32::try_from(s.chars().count()).unwrap_or(i32::MAX))),
+        "str_empty" => text(x).map(|s| Value::Bool(s.is_empty())),
+        "str_at" => text(x).and_then(|s| slice(s, y, 1)),
+        "str_sub" => text(x).and_then(|s| match z {
+            Value::None => slice(s, y, usize::MAX),
+            n => slice(s, y, index(n, MAX_TEXT)?),
+        }),
+        "str_find" => find(x, y, z),
+        _ => return None,
+    })
+}
+
+/// Absolute value of a number, Euclidean length of a list; of a pose that of its position.
+fn norm(v: &Value) -> Outcome {
+    match v {
+        Value::Int(i) => Ok(Value::Int(i.wrapping_abs())),
+        Value::Float(x) => Ok(Value::Float(x.abs())),
+        Value::Pose(_) => three(v).map(|p| Value::Float(p.norm())),
+        _ => list(v).map(|l| Value::Float(l.iter().map(|x| x * x).sum::<f64>().sqrt())),
+    }
+}
+
+fn normalize(v: &Value) -> Outcome {
+    let items = list(v)?;
+    let n = items.iter().map(|x| x * x).sum::<f64>().sqrt();
+    if n > 0.0 && n.is_finite() {
+        Ok(Value::floats(&items.iter().map(|x| x / n).collect::<Vec<_>>()))
+    } else {
+        Err("normalize: the list has no direction".to_owned())
+    }
+}
+
+fn count(v: &Value) -> Outcome {
+    let n = match v {
+        Value::List(items) => items.len(),
+        Value::Pose(_) => 6,
+        Value::Str(s) => s.chars().count(),
+        _ => return Err(format!("{} has no length", v.type_name())),
+    };
+    Ok(Value::Int(i32::try_from(n).unwrap_or(i32::MAX)))
+}
+
+fn transpose(v: &Value) -> Outcome {
+    let Value::List(rows) = v else { return Err(format!("a matrix is needed, this is {}", v.type_name())) };
+    let rows: Vec<Vec<f64>> = rows.iter().map(list).collect::<Result<_, _>>()?;
+    let width = rows.first().map_or(0, Vec::len);
+    if rows.iter().any(|r| r.len() != width) {
+        return Err("rows of a matrix must be equally long".to_owned());
+    }
+    let column = |c: usize| Value::List(rows.iter().filter_map(|r| r.get(c).map(|x| Value::Float(*x))).collect());
+    Ok(Value::List((0..width).map(column).collect()))
+}
+
+fn bits_to_integer(v: &Value) -> Outcome {
+    let Value::List(bits) = v else { return Err(format!("a list of booleans is needed, this is {}", v.type_name())) };
+    if bits.len() > 32 {
+        return Err("more than 32 bits".to_owned());
+    }
+    let mut out = 0_u32;
+    for (i, bit) in bits.iter().enumerate() {
+        out |= u32::from(boolean(bit)?) << i;
+    }
+    Ok(Value::Int(out.cast_signed()))
+}
+
+fn to_number(s: &str) -> Outcome {
+    let s = s.trim();
+    s.parse().map(Value::Int).or_else(|_| s.parse().map(Value::Float)).map_err(|_| format!("'{s}' is not a number"))
+}
+
+fn concatenate(a: &Value, b: &Value) -> Outcome {
+    let out = format!("{a}{b}");
+    if out.len() > MAX_TEXT { Err(format!("a string of more than {MAX_TEXT} bytes")) } else { Ok(Value::Str(out)) }
+}
+
+fn slice(s: &str, from: &Value, n: usize) -> Outcome {
+    let from = index(from, s.chars().count().max(1))?;
+    Ok(Value::Str(s.chars().skip(from).take(n).collect()))
+}
+
+fn find(s: &Value, target: &Value, from: &Value) -> Outcome {
+    let (s, target, from) = (text(s)?, text(target)?, index(from, MAX_TEXT)?);
+    let Some((start, _)) = s.char_indices().nth(from) else { return Ok(Value::Int(-1)) };
+    let found = s.get(start..).and_then(|t| t.find(target).map(|n| t.get(..n).map_or(0, |h| h.chars().count())));
+    Ok(Value::Int(found.and_then(|n| i32::try_from(n + from).ok()).unwrap_or(-1)))
+}

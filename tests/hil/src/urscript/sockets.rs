@@ -1,0 +1,226 @@
+//! Sockets of a script: buffers between the host's bytes and the script's numbers, lines and texts.
+
+use super::arithmetic::Outcome;
+use super::builtins::{Flow, Wait};
+use super::host::{Connect, Host, Received};
+use super::pure::{MAX_TEXT, index, int32, number, text};
+use super::value::Value;
+use std::collections::BTreeMap;
+
+/// Sockets open at once.
+const MAX_SOCKETS: usize = 16;
+/// Bytes kept for a script that does not read; the oldest unread data is the peer's problem: the socket is closed.
+const MAX_BUFFER: usize = 1 << 16;
+/// Numbers per read; UR's limit is 30 for a list read.
+const MAX_NUMBERS: usize = 256;
+/// Seconds after which an attempt to connect fails.
+const CONNECT_SECONDS: f64 = 2.0;
+
+/// Received and not yet read bytes by connection.
+#[derive(Default)]
+pub(crate) struct SocketBuffers(BTreeMap<String, Vec<u8>>);
+
+/// A blocking socket call under way.
+#[derive(Clone, Debug)]
+pub(crate) enum SocketWait {
+    Connect { name: String, address: String, port: u16, steps: u32 },
+    Read { name: String, what: Read, steps: Option<u32> },
+}
+
+/// What a read gives.
+#[derive(Clone, Debug)]
+pub(crate) enum Read {
+    Integers(usize),
+    Bytes(usize),
+    Floats(usize),
+    Line,
+    Any,
+}
+
+/// Control steps in `seconds`, at least one; `None` (for ever) for zero and less, as UR's timeout of 0.
+fn steps(seconds: f64, host: &dyn Host) -> Option<u32> {
+    (seconds > 0.0).then(|| (seconds / host.step_time()).ceil().clamp(1.0, 1e9) as u32)
+}
+
+/// Calls a socket built-in; `None` if `function` is not one.
+pub(crate) fn call(function: &str, a: &[Value], host: &mut dyn Host, s: &mut SocketBuffers) -> Option<Outcome<Flow>> {
+    function.starts_with("socket_").then(|| dispatch(function, a, host, s))
+}
+
+fn dispatch(function: &str, a: &[Value], host: &mut dyn Host, s: &mut SocketBuffers) -> Outcome<Flow> {
+    let none = Value::None;
+    let [x, y, z] = [0, 1, 2].map(|i| a.get(i).unwrap_or(&none));
+    match function {
+        "socket_open" => {
+            let name = text(z)?.to_owned();
+            s.close(&name, host);
+            if s.0.len() >= MAX_SOCKETS {
+                return Err(format!("more than {MAX_SOCKETS} sockets"));
+            }
+            s.0.insert(name.clone(), Vec::new());
+            let port = u16::try_from(index(y, 65_536)?).unwrap_or(0);
+            let steps = steps(CONNECT_SECONDS, host).unwrap_or(1);
+            resume(SocketWait::Connect { name, address: text(x)?.to_owned(), port, steps }, host, s)
+        }
+        "socket_close" => {
+            s.close(text(x)?, host);
+            Ok(Flow::Value(Value::Bool(true)))
+        }
+        "socket_send_int" => Ok(send(&int32(x)?.to_be_bytes(), text(y)?, host, s)),
+        "socket_send_byte" => match x {
+            Value::Str(one) => Ok(send(&one.as_bytes()[..one.len().min(1)], text(y)?, host, s)),
+            n => Ok(send(&[u8::try_from(index(n, 256)?).unwrap_or(0)], text(y)?, host, s)),
+        },
+        "socket_send_string" => Ok(send(x.to_string().as_bytes(), text(y)?, host, s)),
+        "socket_send_line" => Ok(send(format!("{x}\n").as_bytes(), text(y)?, host, s)),
+        "socket_read_binary_integer" => read(Read::Integers(index(x, MAX_NUMBERS)?), y, z, host, s),
+        "socket_read_byte_list" => read(Read::Bytes(index(x, MAX_NUMBERS)?), y, z, host, s),
+        "socket_read_ascii_float" => read(Read::Floats(index(x, MAX_NUMBERS)?), y, z, host, s),
+        "socket_read_line" => read(Read::Line, x, y, host, s),
+        "socket_read_string" => {
+            if !(text(y)?.is_empty() && text(z)?.is_empty()) {
+                return Err("socket_read_string with a prefix or suffix is not supported by this controller".to_owned());
+            }
+            read(Read::Any, x, a.get(4).unwrap_or(&none), host, s)
+        }
+        _ => Err(format!("function '{function}' is not known to this controller")),
+    }
+}
+
+fn send(bytes: &[u8], name: &str, host: &mut dyn Host, s: &SocketBuffers) -> Flow {
+    Flow::Value(Value::Bool(s.0.contains_key(name) && host.socket_send(name, bytes)))
+}
+
+fn read(what: Read, name: &Value, timeout: &Value, host: &mut dyn Host, s: &mut SocketBuffers) -> Outcome<Flow> {
+    let steps = steps(number(timeout)?, host);
+    let name = text(name)?.to_owned();
+    s.fill(&name, host);
+    match s.take(&name, &what) {
+        Some(value) => Ok(Flow::Value(value)),
+        None => Ok(Flow::Wait(Wait::Socket(SocketWait::Read { name, what, steps }))),
+    }
+}
+
+/// Goes on with a blocking call, once in each control step.
+pub(crate) fn resume(wait: SocketWait, host: &mut dyn Host, s: &mut SocketBuffers) -> Outcome<Flow> {
+    match wait {
+        SocketWait::Connect { name, address, port, steps } => match host.socket_connect(&name, &address, port) {
+            Connect::Open => Ok(Flow::Value(Value::Bool(true))),
+            Connect::Pending if steps > 1 => {
+                Ok(Flow::Wait(Wait::Socket(SocketWait::Connect { name, address, port, steps: steps - 1 })))
+            }
+            Connect::Pending | Connect::Failed => {
+                s.close(&name, host);
+                Ok(Flow::Value(Value::Bool(false)))
+            }
+        },
+        SocketWait::Read { name, what, steps } => {
+            let open = s.fill(&name, host);
+            if let Some(value) = s.take(&name, &what) {
+                return Ok(Flow::Value(value));
+            }
+            if !open || steps == Some(1) {
+                return Ok(Flow::Value(nothing(&what)));
+            }
+            Ok(Flow::Wait(Wait::Socket(SocketWait::Read { name, what, steps: steps.map(|n| n - 1) })))
+        }
+    }
+}
+
+/// What a read returns after its timeout: a count of zero and fillers, or an empty text.
+fn nothing(what: &Read) -> Value {
+    let list = |n: usize, filler: Value| {
+        let mut out = vec![Value::Int(0)];
+        out.resize(n + 1, filler);
+        Value::List(out)
+    };
+    match what {
+        Read::Integers(n) | Read::Bytes(n) => list(*n, Value::Int(-1)),
+        Read::Floats(n) => list(*n, Value::Float(f64::NAN)),
+        Read::Line | Read::Any => Value::Str(String::new()),
+    }
+}
+
+fn counted(items: Vec<Value>) -> Value {
+    let mut out = vec![Value::Int(i32::try_from(items.len()).unwrap_or(i32::MAX))];
+    out.extend(items);
+    Value::List(out)
+}
+
+impl SocketBuffers {
+    fn close(&mut self, name: &str, host: &mut dyn Host) {
+        if self.0.remove(name).is_some() {
+            host.socket_close(name);
+        }
+    }
+
+    pub(crate) fn close_all(&mut self, host: &mut dyn Host) {
+        for name in std::mem::take(&mut self.0).into_keys() {
+            host.socket_close(&name);
+        }
+    }
+
+    /// Takes what has arrived; false if no more can come.
+    fn fill(&mut self, name: &str, host: &mut dyn Host) -> bool {
+        let Some(buffer) = self.0.get_mut(name) else { return false };
+        match host.socket_receive(name) {
+            Received::Bytes(bytes) if buffer.len() + bytes.len() <= MAX_BUFFER => {
+                buffer.extend(bytes);
+                true
+            }
+            Received::Nothing => true,
+            Received::Bytes(_) => {
+                self.close(name, host);
+                false
+            }
+            Received::Closed => false,
+        }
+    }
+
+    fn take(&mut self, name: &str, what: &Read) -> Option<Value> {
+        let buffer = self.0.get_mut(name)?;
+        let line_end = |b: &[u8]| b.iter().position(|c| *c == b'\n');
+        match what {
+            Read::Integers(n) => {
+                if buffer.len() < n * 4 {
+                    return None;
+                }
+                let bytes: Vec<u8> = buffer.drain(..n * 4).collect();
+                let number = |c: &[u8]| Value::Int(c.iter().fold(0_u32, |v, b| v << 8 | u32::from(*b)).cast_signed());
+                Some(counted(bytes.chunks_exact(4).map(number).collect()))
+            }
+            Read::Bytes(n) => {
+                if buffer.len() < *n {
+                    return None;
+                }
+                Some(counted(buffer.drain(..*n).map(|b| Value::Int(i32::from(b))).collect()))
+            }
+            Read::Floats(n) => {
+                // `(1.0, 2.0)` up to the bracket.
+                let end = buffer.iter().position(|c| *c == b')')?;
+                let line: Vec<u8> = buffer.drain(..=end).collect();
+                let text = String::from_utf8_lossy(&line);
+                let numbers: Vec<Value> = text
+                    .trim_matches(|c: char| c == '(' || c == ')' || c.is_whitespace())
+                    .split(',')
+                    .filter_map(|t| t.trim().parse().ok().map(Value::Float))
+                    .collect();
+                Some(if numbers.len() == *n { counted(numbers) } else { nothing(what) })
+            }
+            Read::Line => {
+                let end = line_end(buffer)?;
+                let line: Vec<u8> = buffer.drain(..=end).collect();
+                let text = String::from_utf8_lossy(&line);
+                Some(Value::Str(text.trim_end_matches(['\r', '\n']).chars().take(MAX_TEXT / 4).collect()))
+            }
+            Read::Any => {
+                if buffer.is_empty() {
+                    return None;
+                }
+                let n = buffer.len().min(MAX_TEXT / 4);
+                let bytes: Vec<u8> = buffer.drain(..n).collect();
+                Some(Value::Str(String::from_utf8_lossy(&bytes).into_owned()))
+            }
+        }
+    }
+}
