@@ -102,19 +102,19 @@ fn many(scenes: usize, seed: u64, others: usize, blobs: usize, missing: usize) -
 
 #[test]
 fn a_gripper_alone_is_always_found() {
-    assert_eq!(many(40, 1, 0, 0, 0), (40, 0));
+    assert_eq!(many(25, 1, 0, 0, 0), (25, 0));
 }
 
 #[test]
 fn among_tens_of_other_discs_it_is_found_and_never_wrongly() {
-    let (found, wrong) = many(120, 2, 24, 20, 2);
-    assert!(found >= 116 && wrong == 0, "{found} found, {wrong} wrong");
+    let (found, wrong) = many(110, 2, 24, 20, 2);
+    assert!(found >= 107 && wrong == 0, "{found} found, {wrong} wrong");
 }
 
 #[test]
 fn with_half_of_the_marks_hidden_it_is_mostly_found_and_never_wrongly() {
-    let (found, wrong) = many(60, 3, 16, 10, 9);
-    assert!(found >= 54 && wrong == 0, "{found} found, {wrong} wrong");
+    let (found, wrong) = many(50, 3, 16, 10, 9);
+    assert!(found >= 47 && wrong == 0, "{found} found, {wrong} wrong");
 }
 
 #[test]
@@ -123,7 +123,7 @@ fn clutter_alone_is_not_a_gripper() {
     let mut scratch = scratch();
     let mut random = Random(4);
     let all: Vec<usize> = (0..16).collect();
-    for n in 0..30 {
+    for n in 0..20 {
         let truth = pose(&mut random, 0.6);
         let others = clutter(&mut random, 32);
         let pair = scene(&mut random, &rig, &gripper, &truth, &others, &all, 20);

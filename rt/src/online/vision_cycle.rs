@@ -66,6 +66,9 @@ pub struct VisionHealth {
     pub vertical_disparity_px: f64,
 }
 
+/// Turn between prediction and solution above which marks are predicted anew, rad.
+const REMEASURE_TURN: f64 = 0.01;
+
 #[derive(Clone, Copy, Debug)]
 struct Track {
     pose: Pose,
@@ -227,16 +230,25 @@ impl VisionCycle {
     /// Solves, looks once more about the solution for marks that were missing or thrown out, and solves again.
     fn solve(&mut self, frame: &StereoFrame<'_>, start: &Pose, table: &mut MarkTable) -> Option<PoseEstimate> {
         let mut best = pose::estimate(&self.rig, &self.gripper, table, start, &self.settings.pose).ok()?;
-        let before = keep_used(table, &best);
+        let dropped = keep_used(table, &best);
         let narrow = (2.0 + 2.0 * best.residual_px).min(self.settings.marks.search_px);
+        // A large disc's centre lies off its outline's middle by an amount that depends on the tilt: predicted with a tilt that was
+        // wrong, all marks are measured anew.
+        let turn = (start.rotation.inverse() * best.left_from_gripper.rotation).imag().norm_squared();
+        if turn > math::sq(0.5 * REMEASURE_TURN) {
+            *table = [[None; MAX_MARKS]; 2];
+        }
         let had = count(table);
         self.measure(frame, &best.left_from_gripper, narrow, table);
+        if count(table) == 0 {
+            return None;
+        }
         if count(table) > had {
             let again = best.left_from_gripper;
             best = pose::estimate(&self.rig, &self.gripper, table, &again, &self.settings.pose).ok()?;
             keep_used(table, &best);
         }
-        self.faults.outliers += before;
+        self.faults.outliers += dropped;
         let worst = (0..3).map(|i| best.covariance[(i, i)]).fold(0.0, f64::max);
         let s = &self.settings;
         (worst <= s.max_sigma * s.max_sigma && best.residual_px <= s.max_residual_px).then_some(best)

@@ -40,6 +40,8 @@ struct Tile {
 
 #[derive(Clone, Copy)]
 struct Levels {
+    /// The tile's own range: a tile that lies wholly on one side of its level is not looked at pixel by pixel.
+    own: [u8; 2],
     /// Below is dark, by the middle and by the mean.
     dark: [u8; 2],
     /// Above is light.
@@ -67,7 +69,7 @@ struct Part {
 }
 
 const NO_TILE: Tile = Tile { low: 255, high: 0, mean: 0 };
-const NO_LEVELS: Levels = Levels { dark: [0; 2], light: [255; 2] };
+const NO_LEVELS: Levels = Levels { own: [0, 255], dark: [0; 2], light: [255; 2] };
 const NO_RUN: Run = Run { from: 0, to: 0, part: NONE };
 const NO_PART: Part = Part { parent: NONE, last_row: 0, border: false, area: 0, x: 0, y: 0, xx: 0, xy: 0, yy: 0 };
 
@@ -158,11 +160,17 @@ impl BlobScratch {
                 let half = |a: u8, b: u8| ((u16::from(a) + u16::from(b)) / 2) as u8;
                 let mean = (sum / n.max(1)) as u8;
                 let flat = f64::from(high.saturating_sub(low)) < min_contrast;
+                let here = self.tiles.get(j * columns + i).copied().unwrap_or(NO_TILE);
+                let own = [here.low, here.high];
                 if let Some(l) = self.levels.get_mut(j * columns + i) {
                     *l = if flat {
-                        NO_LEVELS
+                        Levels { own, ..NO_LEVELS }
                     } else {
-                        Levels { dark: [half(low, high), half(low, mean)], light: [half(low, high), half(high, mean)] }
+                        Levels {
+                            own,
+                            dark: [half(low, high), half(low, mean)],
+                            light: [half(low, high), half(high, mean)],
+                        }
                     };
                 }
             }
@@ -325,6 +333,11 @@ fn cut(row: &[u8], levels: &[Levels], side: usize, dark: bool, kind: usize, runs
     for (t, (tile, level)) in row.chunks(side).zip(levels).enumerate() {
         let pick = |l: &[u8; 2]| l.get(kind).copied().unwrap_or(0);
         let (below, above) = if dark { (pick(&level.dark), 255) } else { (0, pick(&level.light)) };
+        let [low, high] = level.own;
+        let (none, all) = (low >= below && high <= above, high < below || low > above);
+        if (none && open.is_none()) || (all && open.is_some()) {
+            continue;
+        }
         for (i, &v) in tile.iter().enumerate() {
             let inside = v < below || v > above;
             if inside != open.is_some() {

@@ -199,7 +199,12 @@ fn choose(
     let mut best: Option<PoseEstimate> = None;
     let mut rival: Option<PoseEstimate> = None;
     let mut nearly: Option<PoseEstimate> = None;
+    let most = hypotheses.first().map_or(0, |h| h.matched);
     for h in hypotheses {
+        // Once an answer holds, one that had half of its points cannot come near it.
+        if best.is_some() && 2 * h.matched < most {
+            break;
+        }
         let Some(rough) = from_blobs(rig, gripper, scratch, h) else { continue };
         let Some(e) = measured(rig, gripper, images, settings, &rough) else { continue };
         let holds =

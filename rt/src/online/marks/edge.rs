@@ -44,11 +44,11 @@ pub(crate) fn find(
     }
     // The step between samples i and i + 1, from the NEAR samples on either side.
     let (mut at, mut best) = (0, 0.0);
-    for i in NEAR - 1..count - NEAR {
-        let below: f64 = v.get(i + 1 - NEAR..=i)?.iter().sum();
-        let above: f64 = v.get(i + 1..=i + NEAR)?.iter().sum();
-        if above - below > best {
-            (at, best) = (i, above - below);
+    for (i, w) in v.windows(2 * NEAR).enumerate() {
+        let [a, b, c, d, e, f] = w else { break };
+        let step = (d + e + f) - (a + b + c);
+        if step > best {
+            (at, best) = (i + NEAR - 1, step);
         }
     }
     if best <= 0.0 {

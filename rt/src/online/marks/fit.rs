@@ -30,82 +30,142 @@ pub(crate) fn moved(fit: &Fit, q: Vector2<f64>) -> Vector2<f64> {
     fit.shift + Vector2::new(xx * q.x + xy * q.y, xy * q.x + yy * q.y)
 }
 
+/// An edge's equation: its row of derivatives, and the offset found.
+#[derive(Clone, Copy)]
+struct Line {
+    a: [f64; 5],
+    offset: f64,
+}
+
+type Lines = heapless::Vec<Line, MAX_OUTLINE>;
+
+impl Line {
+    fn residual(&self, x: &Vector5<f64>) -> f64 {
+        let [a, b, c, d, e] = self.a;
+        self.offset - (a * x[0] + b * x[1] + c * x[2] + d * x[3] + e * x[4])
+    }
+}
+
 /// Refines `from` by edges measured relative to the outline as `from` moved it; robust (Tukey) least squares.
 pub(crate) fn refine(outline: &Outline, edges: &[Option<Edge>; MAX_OUTLINE], from: &Fit) -> Option<Fit> {
-    let mut spread = initial_spread(edges)?;
-    let mut x = Vector5::zeros();
-    let mut result = None;
-    for round in 0..5 {
-        let mut n = Matrix5::zeros();
-        let mut g = Vector5::zeros();
-        let inv_var = 1.0 / (spread * spread);
-        for (p, e) in outline.points.iter().zip(edges) {
-            let Some(e) = e else { continue };
-            let a = row(p.normal, p.pixel - outline.centre);
-            let r = e.offset - a.dot(&x);
-            let w = if round == 0 { huber(r / spread) } else { tukey(r / spread) } * inv_var;
-            n.ger(w, &a, &a, 1.0);
-            g.axpy(w * e.offset, &a, 1.0);
-        }
-        for (k, s) in from.stretch.iter().enumerate() {
-            let prior = 1.0 / (SHAPE_SIGMA * SHAPE_SIGMA);
-            *n.get_mut((k + 2, k + 2))? += prior;
-            *g.get_mut(k + 2)? -= prior * s;
-        }
-        let inverse = n.cholesky()?.inverse();
-        x = inverse * g;
-        if !x.iter().all(|v| v.is_finite()) {
-            return None;
-        }
-        // Weights and spread of what is left, for the next round and for the covariance.
-        let (mut sw, mut swr2, mut median) = (0.0, 0.0, heapless::Vec::<f64, MAX_OUTLINE>::new());
-        for (p, e) in outline.points.iter().zip(edges) {
-            let Some(e) = e else { continue };
-            let r = e.offset - row(p.normal, p.pixel - outline.centre).dot(&x);
-            let w = tukey(r / spread);
-            sw += w;
-            swr2 += w * r * r;
-            let _ = median.push(math::fabs(r));
-        }
-        if sw < 5.0 {
-            return None;
-        }
-        let rms = math::sqrt(swr2 / sw);
-        let sigma = math::sqrt(swr2 / (sw - 4.0).max(1.0)).max(EDGE_FLOOR);
-        result = Some(Fit {
-            shift: from.shift + Vector2::new(x[0], x[1]),
-            stretch: [from.stretch[0] + x[2], from.stretch[1] + x[3], from.stretch[2] + x[4]],
-            covariance: inverse.fixed_view::<2, 2>(0, 0) * (sigma * sigma * inv_var),
-            rms,
-            share: sw / outline.points.len() as f64,
-        });
-        spread = (1.4826 * middle(&mut median)).max(2.0 * EDGE_FLOOR);
+    let mut lines = Lines::new();
+    for (p, e) in outline.points.iter().zip(edges) {
+        let Some(e) = e else { continue };
+        let _ = lines.push(Line { a: row(p.normal, p.pixel - outline.centre), offset: e.offset });
     }
-    result
-}
-
-fn row(n: Vector2<f64>, q: Vector2<f64>) -> Vector5<f64> {
-    Vector5::new(n.x, n.y, n.x * q.x, n.x * q.y + n.y * q.x, n.y * q.y)
-}
-
-fn initial_spread(edges: &[Option<Edge>; MAX_OUTLINE]) -> Option<f64> {
-    let mut offsets: heapless::Vec<f64, MAX_OUTLINE> = heapless::Vec::new();
-    for e in edges.iter().flatten() {
-        let _ = offsets.push(e.offset);
-    }
-    if offsets.len() < 5 {
+    if lines.len() < 5 {
         return None;
+    }
+    let mut spread = initial_spread(&lines);
+    let mut x = Vector5::zeros();
+    for round in 0..5 {
+        let inv_var = 1.0 / (spread * spread);
+        let (n, g) = equations(&lines, &x, spread, round == 0, from);
+        let factor = n.cholesky()?;
+        let next = factor.solve(&g);
+        if !next.iter().all(|v| v.is_finite()) {
+            return None;
+        }
+        let settled = (next - x).norm_squared() < 1e-6;
+        x = next;
+        let mut left: heapless::Vec<f64, MAX_OUTLINE> = heapless::Vec::new();
+        for l in &lines {
+            let _ = left.push(math::fabs(l.residual(&x)));
+        }
+        let found = (1.4826 * middle(&mut left)).max(2.0 * EDGE_FLOOR);
+        if round > 0 && (settled || round == 4) {
+            let fit = Fit {
+                shift: from.shift + Vector2::new(x[0], x[1]),
+                stretch: [from.stretch[0] + x[2], from.stretch[1] + x[3], from.stretch[2] + x[4]],
+                ..Fit::default()
+            };
+            return judged(fit, outline, &lines, &x, found, factor.inverse().fixed_view::<2, 2>(0, 0) * inv_var);
+        }
+        spread = found;
+    }
+    None
+}
+
+/// Normal equations of the shift and the stretch, with the prior that the shape is the predicted one.
+fn equations(lines: &Lines, x: &Vector5<f64>, spread: f64, early: bool, from: &Fit) -> (Matrix5<f64>, Vector5<f64>) {
+    let (inv, inv_var) = (1.0 / spread, 1.0 / (spread * spread));
+    let mut n = Matrix5::zeros();
+    let mut g = Vector5::zeros();
+    for l in lines {
+        let z = l.residual(x) * inv;
+        let w = if early { huber(z) } else { tukey(z) } * inv_var;
+        for i in 0..5 {
+            let wa = w * l.a[i];
+            for j in 0..=i {
+                n[(i, j)] += wa * l.a[j];
+            }
+            g[i] += wa * l.offset;
+        }
+    }
+    let prior = 1.0 / (SHAPE_SIGMA * SHAPE_SIGMA);
+    for (k, s) in from.stretch.iter().enumerate() {
+        n[(k + 2, k + 2)] += prior;
+        g[k + 2] -= prior * s;
+    }
+    for i in 0..5 {
+        for j in 0..i {
+            n[(j, i)] = n[(i, j)];
+        }
+    }
+    (n, g)
+}
+
+/// Share of the rim, spread and covariance of a solution; `shape` is the covariance's shape for edges of unit spread.
+fn judged(
+    fit: Fit,
+    outline: &Outline,
+    lines: &Lines,
+    x: &Vector5<f64>,
+    spread: f64,
+    shape: Matrix2<f64>,
+) -> Option<Fit> {
+    let (mut sw, mut swr2) = (0.0, 0.0);
+    for l in lines {
+        let r = l.residual(x);
+        let w = tukey(r / spread);
+        sw += w;
+        swr2 += w * r * r;
+    }
+    if sw < 5.0 {
+        return None;
+    }
+    let sigma = math::sqrt(swr2 / (sw - 4.0).max(1.0)).max(EDGE_FLOOR);
+    Some(Fit {
+        covariance: shape * (sigma * sigma),
+        rms: math::sqrt(swr2 / sw),
+        share: sw / outline.points.len() as f64,
+        ..fit
+    })
+}
+
+fn row(n: Vector2<f64>, q: Vector2<f64>) -> [f64; 5] {
+    [n.x, n.y, n.x * q.x, n.x * q.y + n.y * q.x, n.y * q.y]
+}
+
+fn initial_spread(lines: &Lines) -> f64 {
+    let mut offsets: heapless::Vec<f64, MAX_OUTLINE> = heapless::Vec::new();
+    for l in lines {
+        let _ = offsets.push(l.offset);
     }
     let m = middle(&mut offsets);
     for o in &mut offsets {
         *o = math::fabs(*o - m);
     }
-    Some((1.4826 * middle(&mut offsets)).clamp(0.1, 2.0))
+    (1.4826 * middle(&mut offsets)).clamp(0.1, 2.0)
 }
 
-fn middle(v: &mut [f64]) -> f64 {
-    v.sort_unstable_by(f64::total_cmp);
-    v.get(v.len() / 2).copied().unwrap_or(0.0)
+/// The middle value of a list, in any order; 0 of none.
+pub(crate) fn middle(v: &mut [f64]) -> f64 {
+    if v.is_empty() {
+        return 0.0;
+    }
+    let at = v.len() / 2;
+    *v.select_nth_unstable_by(at, f64::total_cmp).1
 }
 
 fn huber(z: f64) -> f64 {
