@@ -7,6 +7,8 @@ use super::model::{
 };
 use super::planar::{Analysis, analyse};
 use super::refusal::Refusal;
+use super::robust::GATE;
+use super::roundbar::{bar_result, fit_bar};
 use super::sampson::distance;
 
 /// Limit of the centre's standard deviation as a fraction of the radius when the task states none.
@@ -29,9 +31,109 @@ pub fn reconstruct(
     let outer = [left, right].map(|v| v.iter().filter(|p| p.outline == Outline::Outer).copied().collect::<Vec<_>>());
     let p = [p_left, p_right];
     let analysis = analyse([&outer[0], &outer[1]], p, options)?;
-    analysis.verdict.clone()?;
-    let (fit, scores) = choose_plane_model(&analysis, options.rim, options)?;
-    Ok(plane_result(&analysis, &fit, scores, [left, right], p, options))
+    let points = [left, right];
+    match options.rim {
+        RimChoice::Edge | RimChoice::Circle | RimChoice::Ellipse => plane(&analysis, points, p, options),
+        RimChoice::RoundBar => {
+            let bar = fit_bar(points, p, &analysis, options)?;
+            let scores = vec![score(RimModel::RoundBar, bar.fit.chi2, bar.fit.parameters, bar.count, bar.noise)];
+            bar_result(&bar, scores, &analysis, points, p, options)
+        }
+        RimChoice::Auto => any_model(&analysis, points, p, options),
+    }
+}
+
+/// The plane models alone.
+fn plane(
+    a: &Analysis,
+    points: [&[EdgePoint]; 2],
+    p: [&Projection; 2],
+    options: &Options,
+) -> Result<Reconstruction, Refusal> {
+    a.verdict.clone()?;
+    let (fit, scores) = choose_plane_model(a, options.rim, options)?;
+    Ok(plane_result(a, &fit, scores, points, p, options))
+}
+
+/// Plane edge or round bar, by the information criterion over the same points.
+fn any_model(
+    a: &Analysis,
+    points: [&[EdgePoint]; 2],
+    p: [&Projection; 2],
+    options: &Options,
+) -> Result<Reconstruction, Refusal> {
+    let inner = points.map(|v| v.iter().filter(|q| q.outline == Outline::Inner).copied().collect::<Vec<_>>());
+    let both = inner.iter().all(|v| v.len() >= 10);
+    let flat = plane(a, points, p, options);
+    // One outline that a plane rim explains needs no second opinion: a bar would only add a parameter that it cannot determine.
+    if !both && options.bar_diameter.is_none() && flat.is_ok() {
+        return flat;
+    }
+    let bar = match fit_bar(points, p, a, options) {
+        Ok(bar) => bar,
+        Err(e) => return flat.map_err(|flat| if both { e } else { flat }),
+    };
+    let bar_scored = |noise: f64| {
+        let all: Vec<f64> = scaled(&bar.residuals, points, |_| true);
+        score(RimModel::RoundBar, truncated(&all, noise), bar.fit.parameters, all.len(), noise)
+    };
+    let Ok(flat) = flat else {
+        let result = bar_result(&bar, vec![bar_scored(bar.noise)], a, points, p, options);
+        // Neither: the plane's words are about the contours, the bar's only matter where it fits the points.
+        return match (flat, result) {
+            (_, Ok(r)) => Ok(r),
+            (_, Err(e @ Refusal::BarUndetermined { .. })) => Err(e),
+            (Err(e), Err(b)) => Err(if both { b } else { e }),
+            (Ok(r), Err(_)) => Ok(r),
+        };
+    };
+    // The hole of a flat ring is a rim of its own, with as many parameters again.
+    let hole = if both { analyse([&inner[0], &inner[1]], p, options).ok() } else { None };
+    let hole_fit = hole.as_ref().and_then(|h| choose_plane_model(h, RimChoice::Edge, options).ok());
+    let own = scaled(&flat.report.residuals, points, |o| o == Outline::Outer);
+    let parameters = |m: RimModel| if m == RimModel::Circle { 6 } else { 8 };
+    let (mut rest, mut more) = (own, parameters(flat.model));
+    if both {
+        match &hole_fit {
+            Some((f, _)) => {
+                more += f.parameters;
+                for k in 0..2 {
+                    let conic = image_conic(p[k], &f.rim);
+                    rest.extend(inner[k].iter().map(|q| distance(&conic, &q.uv) / q.sigma));
+                }
+            }
+            None => return bar_result(&bar, vec![bar_scored(bar.noise)], a, points, p, options),
+        }
+    }
+    let noise = bar.noise.min(flat.report.noise).max(1e-6);
+    let flat_score = score(flat.model, truncated(&rest, noise), more, rest.len(), noise);
+    let bar_score = bar_scored(noise);
+    let scores: Vec<Score> = flat.report.scores.iter().cloned().chain([bar_score.clone()]).collect();
+    if bar_score.bic < flat_score.bic {
+        match bar_result(&bar, scores.clone(), a, points, p, options) {
+            Ok(r) => return Ok(r),
+            Err(e) if both => return Err(e),
+            Err(_) => {}
+        }
+    }
+    let mut flat = flat;
+    flat.report.scores = scores;
+    Ok(flat)
+}
+
+/// Residuals in units of sigma of the points whose outline is wanted.
+fn scaled(residuals: &[Vec<f64>; 2], points: [&[EdgePoint]; 2], wanted: impl Fn(Outline) -> bool) -> Vec<f64> {
+    let mut out = Vec::new();
+    for k in 0..2 {
+        out.extend(residuals[k].iter().zip(points[k]).filter(|(_, q)| wanted(q.outline)).map(|(r, q)| r / q.sigma));
+    }
+    out
+}
+
+/// Sum of squares with every residual cut off at the outlier gate, so that models with different outliers can be compared.
+fn truncated(r: &[f64], noise: f64) -> f64 {
+    let most = GATE * noise;
+    r.iter().map(|x| if x.is_finite() { (x * x).min(most * most) } else { most * most }).sum()
 }
 
 /// Chooses between circle and ellipse by the information criterion (or as told), and holds the winner against the task's tolerance.

@@ -48,3 +48,33 @@ pub fn rim_points(p: &Projection, rim: &Rim, n: usize) -> Vec<Vector2<f64>> {
 pub fn rim_point(rim: &Rim, t: f64) -> Vector3<f64> {
     rim.centre + rim.axis_a * (rim.a * t.cos()) + rim.axis_b * (rim.b * t.sin())
 }
+
+/// A small seeded generator (SplitMix64, Box-Muller), so that a study is the same on every platform.
+#[derive(Clone, Debug)]
+pub struct Random(u64);
+
+impl Random {
+    /// A stream of its own for every seed.
+    pub fn new(seed: u64) -> Self {
+        Self(seed.wrapping_mul(0xd134_2543_de82_ef95).wrapping_add(0x2545_f491_4f6c_dd1d))
+    }
+
+    /// The next 64 bits.
+    pub fn bits(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+
+    /// Uniform in `[from, to)`.
+    pub fn uniform(&mut self, from: f64, to: f64) -> f64 {
+        from + (to - from) * (self.bits() >> 11) as f64 / (1u64 << 53) as f64
+    }
+
+    /// Standard normal.
+    pub fn normal(&mut self) -> f64 {
+        let u = self.uniform(f64::MIN_POSITIVE, 1.0);
+        (-2.0 * u.ln()).sqrt() * self.uniform(0.0, TAU).cos()
+    }
+}
