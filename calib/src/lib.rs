@@ -3,4 +3,5 @@
 
 pub mod files;
 pub mod golden;
+pub mod montecarlo;
 pub mod offline;

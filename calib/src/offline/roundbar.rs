@@ -78,7 +78,8 @@ pub(crate) fn fit_bar(
     }
     let dof = count.saturating_sub(fitted.parameters).max(1);
     let mut noise = (fitted.chi2 / dof as f64).sqrt().max(1e-6);
-    let excess_and_dof = one_view_chi2(&all, &keep, split, &fitted.torus, free);
+    let excess_and_dof =
+        one_view_chi2(&all, &keep, split, &fitted.torus, if inner { Free::OneView } else { Free::Pose });
     let single_noise = (excess_and_dof.0 / excess_and_dof.1.max(1) as f64).sqrt().max(1e-6);
     let known = options.noise == Noise::AtLeastGiven && single_noise <= 1.0;
     let yardstick = if known { 1.0 } else { single_noise.max(1e-4 / typical_sigma(points[0])) };
@@ -111,7 +112,6 @@ fn flip(fit: &mut TorusFit) {
 
 /// Sum of the chi-squared of the best torus of each view alone, and its degrees of freedom.
 fn one_view_chi2(all: &[Ray], keep: &[bool], split: usize, torus: &Torus, free: Free) -> (f64, usize) {
-    let free = if free == Free::All { Free::OneView } else { Free::KnownBar };
     let mut chi2 = 0.0;
     for (rays, keep) in [(&all[..split], &keep[..split]), (&all[split..], &keep[split..])] {
         chi2 += fit(rays, keep, torus, free).map_or(f64::INFINITY, |f| f.chi2);
@@ -222,12 +222,12 @@ pub(crate) fn bar_result(
     let angle = vergence(&turn, &outer.centres);
     tolerable(sigma_centre, sigma_normal, torus.core, angle, RimModel::RoundBar, options)
         .map_err(|e| if alone { undetermined(sigma_centre, sigma_normal) } else { e })?;
-    // Radii that are confused with each other by more than a fifth of the bar are not an answer even where centre and normal are.
+    // Radii that are confused with each other by more than a tenth of the bar are not an answer even where centre and normal are.
     let cov_axes = match bar.fit.parameters {
         7 => cov.fixed_view::<2, 2>(5, 5).into_owned(),
         _ => Matrix2::new(cov[(5, 5)], 0.0, 0.0, 0.0),
     };
-    if alone && cov_axes[(1, 1)].sqrt() > 0.2 * torus.bar {
+    if alone && cov_axes[(1, 1)].sqrt() > 0.1 * torus.bar {
         return Err(undetermined(sigma_centre, sigma_normal));
     }
     let mut report = base_report(outer, points);

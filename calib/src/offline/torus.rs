@@ -128,6 +128,8 @@ pub(crate) enum Free {
     KnownBar,
     /// One view fixes everything but the scale: the core radius is held.
     OneView,
+    /// Both radii are held: one outline of one view determines no more than the pose.
+    Pose,
 }
 
 /// A fitted torus.
@@ -155,7 +157,11 @@ impl Problem<7> for Fit<'_> {
     type State = Torus;
 
     fn parameters(&self) -> usize {
-        if self.free == Free::All { 7 } else { 6 }
+        match self.free {
+            Free::All => 7,
+            Free::KnownBar | Free::OneView => 6,
+            Free::Pose => 5,
+        }
     }
 
     fn linearise(&self, x: &Torus) -> Option<Linear<7>> {
@@ -184,6 +190,7 @@ impl Problem<7> for Fit<'_> {
                 }
                 Free::KnownBar => j[5] = -c.w.dot(&c.e) * k,
                 Free::OneView => j[5] = -k,
+                Free::Pose => {}
             }
             out.cost += r * r;
             for a in 0..n {
@@ -228,6 +235,7 @@ impl Problem<7> for Fit<'_> {
             }
             Free::KnownBar => y.core += d[5] * self.unit,
             Free::OneView => y.bar += d[5] * self.unit,
+            Free::Pose => {}
         }
         y
     }
@@ -238,7 +246,7 @@ pub(crate) fn fit(rays: &[Ray], keep: &[bool], start: &Torus, free: Free) -> Opt
     let unit = start.core;
     let mut torus = *start;
     let mut found = None;
-    for _ in 0..4 {
+    for _ in 0..6 {
         let axes = torus.axes();
         let weight: Vec<f64> =
             rays.iter().map(|r| torus.closest(r, &axes).map_or(0.0, |c| 1.0 / (r.sigma * c.slope))).collect();
@@ -255,6 +263,18 @@ pub(crate) fn fit(rays: &[Ray], keep: &[bool], start: &Torus, free: Free) -> Opt
         found = Some(TorusFit { torus, chi2: minimum.cost, parameters: n, cofactor });
         if moved < 1e-9 {
             break;
+        }
+    }
+    // The last scales belong to the state before the last: the cost that counts is the one in pixels at the end.
+    if let Some(f) = &mut found {
+        let axes = f.torus.axes();
+        f.chi2 = 0.0;
+        for (ray, keep) in rays.iter().zip(keep) {
+            if *keep {
+                let c = f.torus.closest(ray, &axes)?;
+                let r = (c.distance - f.torus.bar) / (ray.sigma * c.slope);
+                f.chi2 += r * r;
+            }
         }
     }
     found

@@ -1,0 +1,8 @@
+//! Prints the accuracy study's table: `cargo run --release -p graspd-calib --example study [trials] [seed]`.
+
+fn main() {
+    let mut arguments = std::env::args().skip(1).filter_map(|a| a.parse::<u64>().ok());
+    let trials = arguments.next().unwrap_or(1000);
+    let seed = arguments.next().unwrap_or(1);
+    print!("{}", graspd_calib::montecarlo::table(trials as usize, seed, |name| eprintln!("{name}")));
+}
