@@ -59,18 +59,16 @@ pub(super) fn way(c: &CycleConfig, limits: &Limits, pose: &Pose, q: &Joints, s: 
         Leg::line(pose, &s.pregrasp.left_from_gripper),
         Leg::line(&s.pregrasp.left_from_gripper, &s.grasp.left_from_gripper),
     ];
-    for leg in &legs {
-        for k in 1..=SAMPLES {
-            let at = leg.pose(f64::from(k) / f64::from(SAMPLES));
-            if points(c, &at, s.best_view) < c.settings.law.min_points {
-                return Err(Reject::PathLeavesView);
-            }
-            joints = newton(&c.dh, &(base_from_left * at * unmount), &joints).map_err(|_| Reject::OutOfReach)?;
-            let inside = (0..6).all(|i| joints[i] >= min[i] && joints[i] <= max[i]);
-            let sigma = singularity(&c.dh.body_jacobian(&joints, mount), &c.settings.rates).map_or(0.0, |(s, _)| s);
-            if !inside || sigma <= c.settings.rates.hard_sigma {
-                return Err(Reject::OutOfReach);
-            }
+    let samples = || legs.iter().flat_map(|leg| (1..=SAMPLES).map(|k| leg.pose(f64::from(k) / f64::from(SAMPLES))));
+    if samples().any(|at| points(c, &at, s.best_view) < c.settings.law.min_points) {
+        return Err(Reject::PathLeavesView);
+    }
+    for at in samples() {
+        joints = newton(&c.dh, &(base_from_left * at * unmount), &joints).map_err(|_| Reject::OutOfReach)?;
+        let inside = (0..6).all(|i| joints[i] >= min[i] && joints[i] <= max[i]);
+        let sigma = singularity(&c.dh.body_jacobian(&joints, mount), &c.settings.rates).map_or(0.0, |(s, _)| s);
+        if !inside || sigma <= c.settings.rates.hard_sigma {
+            return Err(Reject::OutOfReach);
         }
     }
     Ok(())

@@ -64,17 +64,19 @@ impl Probe {
         let moved = scaled(&(self.start.inverse() * seen));
         let agreement = moved.dot(&intended) / intended.norm_squared().max(1e-12);
         let (meant_m, moved_m) = (intended.norm(), moved.norm());
+        // What was seen across the intended direction: a mounting turned about the approach is right along it only.
+        let astray = (moved - intended * agreement).norm() / meant_m.max(1e-6);
         let fault = FaultCause::WrongWay { agreement, moved_m };
         if self.grew >= 10 {
             return Some(fault);
         }
         if meant_m >= w.probe_m {
-            if agreement >= w.probe_agreement && agreement < 2.5 {
+            if agreement >= w.probe_agreement && agreement < 2.0 && astray < w.probe_agreement {
                 self.passed = true;
                 return None;
             }
             // The opposite of what was meant, or half of the way to the limit and still no agreement.
-            if agreement < -0.3 || meant_m >= w.probe_limit_m {
+            if agreement < -0.3 || astray > 1.0 || meant_m >= w.probe_limit_m {
                 return Some(fault);
             }
         }

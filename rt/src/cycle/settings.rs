@@ -86,7 +86,7 @@ pub struct WatchSettings {
     pub probe_share: f64,
     /// Intended motion after which the probe judges, metres (unit-scaled). Default 0.003.
     pub probe_m: f64,
-    /// Share of the intended motion that must be seen in the pictures. Default 0.4.
+    /// Share of the intended motion that must be seen in the pictures, and greatest share seen across it. Default 0.4.
     pub probe_agreement: f64,
     /// Motion at which a probe that has not passed is a fault, metres (unit-scaled). Default 0.012.
     pub probe_limit_m: f64,

@@ -142,8 +142,8 @@ impl ArmWatch {
         for i in 0..6 {
             let error = (new.qd[i] - high[i]).max(0.0) + (new.qd[i] - low[i]).min(0.0);
             off |= math::fabs(error) > self.settings.tracking_rad_per_s;
-            // Forgets in about a second, so that a bias of the measurement does not add up.
-            self.drift[i] = (self.drift[i] + error * dt) * (1.0 - dt);
+            // Forgets in about five seconds, so that a bias of the measurement does not add up.
+            self.drift[i] = (self.drift[i] + error * dt) * (1.0 - 0.2 * dt);
         }
         self.off_since_ns = if off { self.off_since_ns.or(Some(now_ns)) } else { None };
         let resting = now_ns.saturating_sub(self.moving_cmd_ns) > self.settings.settle_ns;

@@ -198,7 +198,8 @@ pub const fn step(mode: Mode, event: Event, now_ns: u64) -> (Mode, Action) {
         (_, Event::Reset { .. }) => (mode, Action::Refuse(Reject::WrongMode)),
 
         (Idle, Event::Ready) => (Tracking, Action::Changed),
-        (Tracking | Armed, Event::NotReady) => (Idle, Action::Changed),
+        // Armed stays armed while marks are hidden: `servo` will be refused until they are back.
+        (Tracking, Event::NotReady) => (Idle, Action::Changed),
         (_, Event::Ready | Event::NotReady) => (mode, Action::None),
 
         (Tracking, Event::Arm(Ok(()))) => (Armed, Action::Changed),
@@ -258,7 +259,7 @@ mod tests {
     const TABLE: [&str; 9] = [
         "T.xxxxx.xx.....", // Idle
         ".IAxxxx.xx.....", // Tracking
-        ".IxxTSxTxx....F", // Armed
+        "..xxTSxTxx....F", // Armed
         "..xxxxxtxxC..af", // Servoing
         "..xxxxxtxx.S.af", // Converged
         "..xxxxx.xx..T.f", // Stopping, then tracking

@@ -2,9 +2,10 @@
 
 mod world;
 
-use graspd_rt::cycle::{RequestKind, Stage};
-use graspd_rt::mode::ModeName;
-use world::{MS, World};
+use graspd_rt::cycle::{CommandCycle, RequestKind, Stage, Why};
+use graspd_rt::geom::{Pose, Twist, exp_twist};
+use graspd_rt::mode::{FaultCause, ModeName, Reject};
+use world::{Faults, MS, World};
 
 /// Runs until converged; seconds it took.
 fn converge(w: &mut World, limit_s: u64) -> Option<f64> {
@@ -41,4 +42,343 @@ fn arrives_from_anywhere_with_a_wrong_arm_model() {
         slowest = slowest.max(took);
     }
     println!("50 seeds: worst {worst:.3} mm, {worst_angle:.3} degrees, slowest {slowest:.2} s");
+}
+
+/// An arm that turns its joints the wrong way, and a mounting that is half a turn off: the probe stops both at once.
+#[test]
+fn the_wrong_way_is_noticed_by_the_probe() {
+    for seed in 0..16 {
+        for kind in 0..2 {
+            let mut w = World::new(seed, |_| {});
+            if kind == 0 {
+                w.sense = -1.0;
+            } else {
+                // The daemon is told of a mounting that is half a turn about the approach off.
+                let half = exp_twist(&Twist::new(0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI));
+                let mut config = w.config.clone();
+                config.gripper.flange_from_gripper *= half;
+                w.cycle = CommandCycle::new(config).unwrap();
+            }
+            w.run(500);
+            w.beat(None, true);
+            w.beat(Some(RequestKind::Arm), false);
+            let started = w.beat(Some(RequestKind::Servo), false).reply.unwrap().result;
+            if started.is_err() {
+                // A mounting so wrong that the way is out of reach is refused before anything moves.
+                assert_eq!(kind, 1, "seed {seed}: {started:?}");
+                continue;
+            }
+            let start = w.left_from_gripper();
+            let mut fault = None;
+            for _ in 0..2_000 {
+                let out = w.beat(None, false);
+                fault = fault.or(w.cycle.mode().fault().copied());
+                // How far from the straight way: a mounting that is wrong across the approach is right along it.
+                let way = w.setpoint.pregrasp.left_from_gripper.translation.vector - start.translation.vector;
+                let gone = w.left_from_gripper().translation.vector - start.translation.vector;
+                let along = if kind == 0 { 0.0 } else { (gone.dot(&way) / way.norm_squared()).clamp(0.0, 1.0) };
+                let far = (gone - way * along).norm() * 1e3;
+                assert!(far < 20.0, "seed {seed} kind {kind}: {far} mm astray");
+                if matches!(out.record.mode, ModeName::Fault | ModeName::Converged | ModeName::Armed) {
+                    break;
+                }
+            }
+            let arrived = w.cycle.mode().name() == ModeName::Converged;
+            if kind == 1 && arrived && w.error_to(&w.setpoint.grasp.left_from_gripper).0 < 1.0 {
+                // The loop was closed over a small error of the mounting, and truly arrived.
+                continue;
+            }
+            let fault = fault.unwrap_or_else(|| panic!("seed {seed} kind {kind}: not noticed"));
+            let known = matches!(
+                fault.cause,
+                FaultCause::WrongWay { .. } | FaultCause::TrackingError { .. } | FaultCause::MotionMismatch { .. }
+            );
+            assert!(known, "seed {seed} kind {kind}: {:?}", fault.cause);
+            assert_eq!(w.cycle.mode().name(), ModeName::Fault);
+            w.judge_wire();
+        }
+    }
+}
+
+/// Every fault at a random instant of the motion: named, at rest within bound, silent until an operator's reset, which moves nothing.
+#[test]
+fn any_fault_at_any_instant_ends_at_rest() {
+    type Set = fn(&mut Faults);
+    // Fault, code, milliseconds to the first slower set-point.
+    let table: [(Set, &str, u64); 19] = [
+        (|f| f.no_vision = true, "F-CAM-01", 150),
+        (|f| f.no_state = true, "F-ARM-02", 25),
+        (|f| f.link_down = true, "F-ARM-01", 4),
+        (|f| f.echo_stuck = true, "F-ARM-03", 56),
+        (|f| f.safety_bits = Some(1 << 2), "F-ARM-05", 4),
+        (|f| f.safety_bits = Some(1 << 7), "F-ARM-06", 4),
+        (|f| f.safety_bits = Some(1 << 4), "F-ARM-07", 4),
+        (|f| f.safety_bits = Some(1 << 9), "F-ARM-08", 4),
+        (|f| f.robot_mode = Some(5), "F-ARM-09", 4),
+        (|f| f.runtime = Some(4), "F-ARM-10", 4),
+        (|f| f.token = true, "F-ARM-12", 4),
+        (|f| f.clock_back = true, "F-ARM-13", 4),
+        (|f| f.nan_state = true, "F-ARM-16", 4),
+        (|f| f.jump_state = true, "F-ARM-16", 4),
+        (|f| f.stall = true, "F-TIM-01", 32),
+        (|f| f.lost_marks = true, "H-01", 90),
+        (|f| f.nan_marks = true, "H-01", 60),
+        (|f| f.jump_marks = true, "F-MRK-01", 120),
+        (|f| f.slider_zero = true, "H-06", 4),
+    ];
+    for (k, (set, code, bound_ms)) in table.into_iter().enumerate() {
+        for trial in 0..3 {
+            let mut w = World::new(100 + 3 * k as u64 + trial, |_| {});
+            w.start();
+            let wait = 300 + w.rng.next() % 1500;
+            w.run(wait);
+            if !w.cycle.mode().drives() {
+                panic!("{code}: the motion had already ended: {:?}", w.cycle.mode());
+            }
+            let injected = w.now;
+            set(&mut w.faults);
+            let mut named = None;
+            let limit = injected + bound_ms * MS + w.cycle.limits().ramp_ns() + 4 * MS;
+            while w.now < limit {
+                let out = w.beat(None, false);
+                if let Some(e) = out.event {
+                    if let (None, Why::Fault(_) | Why::Hold(_)) = (named, e.why) {
+                        named = Some((e.why, w.now - injected));
+                    }
+                }
+                w.faults.stall = false;
+            }
+            let (why, after) = named.unwrap_or_else(|| panic!("{code} was not noticed"));
+            let (found, latched) = match why {
+                Why::Fault(c) => (c.code(), true),
+                Why::Hold(c) => (c.code(), false),
+                _ => unreachable!(),
+            };
+            assert_eq!(found, code);
+            assert!(after <= bound_ms * MS, "{code} after {} ms", after / MS);
+            assert_eq!(w.sent.last().unwrap().1, [0.0; 6], "{code}: at rest in bound");
+            // The fault goes; nothing moves by itself.
+            w.faults = Faults::default();
+            w.run(400);
+            let from = w.sent.len() - 150;
+            assert!(w.sent[from..].iter().all(|s| s.1 == [0.0; 6]), "{code} moved again by itself");
+            if latched {
+                assert_eq!(w.cycle.mode().fault().unwrap().cause.code(), code, "the first cause is kept");
+                let servo = w.beat(Some(RequestKind::Servo), false).reply.unwrap().result;
+                assert_eq!(servo, Err(Reject::WrongMode));
+                assert_eq!(w.beat(Some(RequestKind::Reset), false).reply.unwrap().result, Ok(()), "{code}");
+                w.run(300);
+                assert_eq!(w.cycle.mode().name(), ModeName::Tracking, "{code}");
+            } else {
+                assert_eq!(w.cycle.mode().name(), ModeName::Armed, "{code}");
+                assert_eq!(w.beat(Some(RequestKind::Servo), false).reply.unwrap().result, Ok(()), "{code}");
+            }
+            w.judge_wire();
+        }
+    }
+}
+
+/// A picture that stands still while the arm moves, an arm that stands still while it is told to move, one that creeps.
+#[test]
+fn pictures_and_joints_that_disagree_are_noticed() {
+    type Set = fn(&mut Faults);
+    let table: [(Set, &[&str], u64); 2] =
+        [(|f| f.frozen_vision = true, &["F-MRK-02", "F-MRK-01"], 260), (|f| f.stuck_arm = true, &["F-ARM-14"], 1500)];
+    for (set, codes, bound_ms) in table {
+        for trial in 0..6 {
+            let mut w = World::new(300 + trial, |_| {});
+            w.start();
+            // Into full speed: before that there is little to tell by.
+            while w.beat(None, false).record.screw.fixed_rows::<3>(0).norm() < 0.06 {
+                assert!(w.cycle.mode().drives(), "never came to speed");
+            }
+            w.run(60);
+            let injected = w.now;
+            set(&mut w.faults);
+            while w.now < injected + bound_ms * MS && w.cycle.mode().fault().is_none() {
+                w.beat(None, false);
+            }
+            let fault = w.cycle.mode().fault().unwrap_or_else(|| panic!("{codes:?} trial {trial}: not noticed"));
+            assert!(codes.contains(&fault.cause.code()), "{:?}", fault.cause);
+        }
+    }
+    let mut w = World::new(310, |_| {});
+    w.run(500);
+    w.beat(None, true);
+    w.beat(Some(RequestKind::Arm), false);
+    w.faults.drift_arm = true;
+    w.run(120);
+    assert_eq!(w.cycle.mode().fault().map(|f| f.cause.code()), Some("F-ARM-15"));
+}
+
+/// A stop from any instant: the first slower set-point in the same beat, rest within the ramp, disarmed.
+#[test]
+fn a_stop_request_is_a_bounded_ramp() {
+    for seed in 0..20 {
+        let mut w = World::new(400 + seed, |_| {});
+        w.start();
+        let wait = 50 + w.rng.next() % 2500;
+        w.run(wait);
+        let before = w.sent.len();
+        let out = w.beat(Some(RequestKind::Stop), false);
+        assert_eq!(out.reply.unwrap().result, Ok(()));
+        w.run(w.cycle.limits().ramp_ns() / MS + 4);
+        let norm = |r: &[f64; 6]| r.iter().map(|v| v * v).sum::<f64>();
+        for pair in w.sent[before - 1..].windows(2) {
+            assert!(norm(&pair[1].1) <= norm(&pair[0].1), "seed {seed}: the stop sped up");
+        }
+        assert_eq!(w.sent.last().unwrap().1, [0.0; 6]);
+        assert_eq!(w.cycle.mode().name(), ModeName::Tracking);
+        assert_eq!(w.beat(Some(RequestKind::Servo), false).reply.unwrap().result, Err(Reject::WrongMode));
+        w.judge_wire();
+    }
+}
+
+/// Requests in any order with faults that come and go: rates are zero in every mode that does not drive or stop, and within limits.
+#[test]
+fn random_requests_and_faults_never_move_an_arm_that_is_not_servoing() {
+    let requests = [
+        RequestKind::Arm,
+        RequestKind::Disarm,
+        RequestKind::Servo,
+        RequestKind::Stop,
+        RequestKind::Reset,
+        RequestKind::Gripper { close: true },
+        RequestKind::Gripper { close: false },
+        RequestKind::Turn { angle_rad: 0.3 },
+        RequestKind::Turn { angle_rad: f64::NAN },
+        RequestKind::Retreat,
+        RequestKind::LeaseLost,
+    ];
+    for seed in 0..12 {
+        let mut w = World::new(500 + seed, |_| {});
+        w.run(300);
+        let mut moved = false;
+        for _ in 0..60 {
+            let r = requests[(w.rng.next() % requests.len() as u64) as usize];
+            // Often enough the right order, so that it moves at all.
+            let r = match w.cycle.mode().name() {
+                ModeName::Tracking if w.rng.next() % 2 == 0 => RequestKind::Arm,
+                ModeName::Armed if w.rng.next() % 2 == 0 => RequestKind::Servo,
+                ModeName::Fault if w.rng.next() % 2 == 0 => RequestKind::Reset,
+                _ => r,
+            };
+            let f = &mut w.faults;
+            *f = Faults::default();
+            let draw = w.rng.next() % 24;
+            match draw {
+                0 => w.faults.no_vision = true,
+                1 => w.faults.no_state = true,
+                2 => w.faults.safety_bits = Some(4),
+                3 => w.faults.nan_marks = true,
+                4 => w.faults.link_down = true,
+                5 => w.faults.slider_zero = true,
+                6 => w.faults.jump_marks = true,
+                _ => {}
+            }
+            let offer = w.rng.next() % 3 == 0;
+            let mut out = w.beat(Some(r), offer);
+            for _ in 0..w.rng.next() % 200 {
+                let still =
+                    matches!(out.record.mode, ModeName::Idle | ModeName::Tracking | ModeName::Armed | ModeName::Fault);
+                assert!(!still || out.command.rates == [0.0; 6], "seed {seed}: moves while {:?}", out.record.mode);
+                moved |= out.command.rates != [0.0; 6];
+                out = w.beat(None, false);
+            }
+        }
+        w.judge_wire();
+        assert!(moved, "seed {seed}: a test in which nothing ever moves proves nothing");
+    }
+}
+
+/// After convergence: close, turn the valve with the loop closed, open, retreat.
+#[test]
+fn turns_the_valve_about_its_axis_and_retreats() {
+    for seed in [0, 1, 5] {
+        let mut w = World::new(seed, |s| {
+            s.task.close_outputs = 0x0001_0001;
+            s.task.open_outputs = 0x0001_0000;
+        });
+        converge(&mut w, 20).unwrap();
+        let grasp = w.setpoint.grasp.left_from_gripper;
+        let angle = 0.4;
+        assert_eq!(
+            w.beat(Some(RequestKind::Turn { angle_rad: 9.0 }), false).reply.unwrap().result,
+            Err(Reject::BadValue)
+        );
+        assert_eq!(w.beat(Some(RequestKind::Turn { angle_rad: angle }), false).reply.unwrap().result, Ok(()));
+        assert_eq!(w.outputs, 0x0001_0001, "closed before it turns");
+        let before = w.error_to(&grasp);
+        w.run(500);
+        assert!((w.error_to(&grasp).0 - before.0).abs() < 0.5, "waits for the fingers");
+        w.run(5_000);
+        let n = w.setpoint.object_normal * angle;
+        let turned = exp_twist(&Twist::new(0.0, 0.0, 0.0, n.x, n.y, n.z)).rotation;
+        // The centre is the grasp's own origin here, so the turn is all rotation.
+        let goal = Pose::from_parts(grasp.translation, turned * grasp.rotation);
+        let (mm, deg) = w.error_to(&goal);
+        assert!(mm < 1.0 && deg < 0.5, "seed {seed}: {mm} mm {deg} degrees after the turn");
+        assert_eq!(w.cycle.mode().name(), ModeName::Converged);
+        assert_eq!(w.beat(Some(RequestKind::Retreat), false).reply.unwrap().result, Ok(()));
+        assert_eq!(w.outputs, 0x0001_0000, "opens before it leaves");
+        let out = w.run(6_000);
+        assert_eq!(out.record.stage, Stage::Retreat);
+        let (mm, deg) = w.error_to(&(goal * Pose::translation(0.0, 0.0, -0.07)));
+        assert!(mm < 1.0 && deg < 0.5, "seed {seed}: {mm} mm {deg} degrees after the retreat");
+        w.judge_wire();
+    }
+}
+
+/// Reduced mode lowers the speed within a beat of the ramp; a slow slider slows the motion and winds nothing up.
+#[test]
+fn reduced_mode_and_slider_only_slow_it_down() {
+    let mut w = World::new(7, |_| {});
+    w.slider = 0.3;
+    let slow = converge(&mut w, 60).unwrap();
+    w.judge_wire();
+    let mut w = World::new(7, |_| {});
+    let normal = converge(&mut w, 20).unwrap();
+    assert!(slow > 1.5 * normal, "{slow} {normal}");
+    let mut w = World::new(7, |_| {});
+    w.faults.safety_bits = Some(1 << 1);
+    w.start();
+    for _ in 0..1500 {
+        let out = w.beat(None, false);
+        let top = out.command.rates.iter().fold(0.0_f64, |m, v| m.max(v.abs()));
+        assert!(top <= 0.4 * 0.5 + 1e-9, "{top}");
+    }
+}
+
+/// The same inputs give the same outputs to the bit.
+#[test]
+fn the_same_world_twice_is_the_same_to_the_bit() {
+    let run = || {
+        let mut w = World::new(11, |_| {});
+        w.start();
+        w.run(1_500);
+        w.sent.iter().flat_map(|s| s.1.map(f64::to_bits)).collect::<Vec<_>>()
+    };
+    assert_eq!(run(), run());
+}
+
+/// A goal that the arm cannot reach, a way that leaves the pictures and a plan without marks are refused before anything moves.
+#[test]
+fn bad_goals_are_refused_with_the_reason() {
+    let refused = |change: fn(&mut World)| {
+        let mut w = World::new(3, |_| {});
+        w.run(500);
+        change(&mut w);
+        if let Some(Err(r)) = w.beat(None, true).setpoint_reply {
+            return r;
+        }
+        w.beat(Some(RequestKind::Arm), false);
+        let r = w.beat(Some(RequestKind::Servo), false).reply.unwrap().result.unwrap_err();
+        assert_eq!(w.cycle.mode().name(), ModeName::Armed);
+        r
+    };
+    assert_eq!(refused(|w| w.setpoint.grasp.marks = Default::default()), Reject::BadSetPoint);
+    assert_eq!(refused(|w| w.setpoint.grasp.left_from_gripper.translation.vector.x = f64::NAN), Reject::BadSetPoint);
+    assert_eq!(refused(|w| w.setpoint.object_normal *= 0.0), Reject::BadSetPoint);
+    assert_eq!(refused(|w| w.setpoint.grasp.left_from_gripper.translation.vector.z += 3.0), Reject::OutOfReach);
+    assert_eq!(refused(|w| w.setpoint.pregrasp.left_from_gripper.translation.vector.x += 2.0), Reject::PathLeavesView);
 }
