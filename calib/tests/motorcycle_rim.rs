@@ -68,6 +68,10 @@ fn one_click_a_view_is_no_worse_than_the_reference() {
                     p.file.warnings
                 );
                 std::fs::write("/tmp/plan_moto.toml", &p.text).unwrap();
+                let png =
+                    graspd_calib::offline::overlay::draw(&p, [&e.pictures[0], &e.pictures[1]], &e.rig, &e.gripper)
+                        .unwrap();
+                std::fs::write("/tmp/plan_moto.png", png).unwrap();
             }
             Err(e) => eprintln!("{e}"),
         }

@@ -1,6 +1,7 @@
 //! The off-line stage, one file per step of the paper: from edge points in two views to a rim in space and a grasp on it.
 
 pub mod arcs;
+mod canvas;
 pub mod circle;
 pub mod cone;
 pub mod conic;
@@ -14,6 +15,7 @@ pub mod lens;
 mod levenberg;
 pub mod ml;
 pub mod model;
+pub mod overlay;
 pub mod pairing;
 pub mod pencil;
 pub mod picture;
