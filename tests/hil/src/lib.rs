@@ -1,4 +1,6 @@
 //! The simulated world.
 
 pub mod plant;
+pub mod scenario;
+pub mod scene;
 pub mod urscript;

@@ -1,0 +1,223 @@
+//! The fixed layers of one view, rendered once: what lies behind the valve, the valve itself with its coverage, and its depth.
+
+use super::raster::Rect;
+use super::sensor::{SCALE, Sensor};
+use super::stage::Stage;
+use graspd_rt::geom::{Camera, Pixel, Pose, Vec3};
+
+/// Samples along each side of a pixel where something changes in it.
+const FINE: usize = 10;
+
+/// The fixed layers of one view. Greys are linear and not yet blurred, except in `exposed`.
+#[derive(Debug)]
+pub(super) struct Layers {
+    /// Width in pixels.
+    pub(super) width: usize,
+    /// Height in pixels.
+    pub(super) height: usize,
+    /// Grey of everything behind the valve.
+    pub(super) backdrop: Vec<f32>,
+    /// The pixels that the valve touches.
+    pub(super) valve_rect: Rect,
+    /// Per pixel of `valve_rect`: grey times coverage, coverage, and distance along the ray.
+    pub(super) valve: Vec<[f32; 3]>,
+    /// Unit rays of `valve_rect`'s pixel centres in the camera frame.
+    pub(super) rays: Vec<Vec3>,
+    /// Light that arrives, by the lens.
+    pub(super) falloff: Vec<f32>,
+    /// The blurred picture without gripper in 64ths of a grey value, and each pixel's noise amplitude.
+    pub(super) exposed: (Vec<i16>, Vec<i16>),
+}
+
+impl Layers {
+    /// Renders the layers of one view. Takes some tenths of a second.
+    pub(super) fn render(stage: &Stage, camera: &Camera, camera_from_object: &Pose, sensor: &Sensor) -> Self {
+        let (w, h) = (camera.width as usize, camera.height as usize);
+        let object_from_camera = camera_from_object.inverse();
+        let o = object_from_camera.translation.vector;
+        let corner2 = (0.25 * ((w * w + h * h) as f64)).max(1.0);
+        let falloff: Vec<f32> = (0..w * h)
+            .map(|i| {
+                let (dx, dy) = ((i % w) as f64 - 0.5 * w as f64, (i / w) as f64 - 0.5 * h as f64);
+                sensor.falloff((dx * dx + dy * dy) / corner2)
+            })
+            .collect();
+
+        // One ray a pixel first, with the ray's change along the row and down the column.
+        let ray = |u: f64, v: f64| camera.ray(Pixel::new(u, v)).unwrap_or_else(Vec3::z);
+        let mut first = Vec::with_capacity(w * h);
+        for y in 0..h {
+            for x in 0..w {
+                let d = object_from_camera.rotation * ray(x as f64, y as f64);
+                let behind = stage.backdrop(&o, &d);
+                first.push((behind, stage.valve(&o, &d)));
+            }
+        }
+        let mut backdrop: Vec<f32> = first.iter().map(|((g, _), _)| *g as f32).collect();
+        let mut valve: Vec<[f32; 3]> = first
+            .iter()
+            .map(|(_, v)| v.map_or([0.0, 0.0, f32::INFINITY], |(t, g, _)| [g as f32, 1.0, t as f32]))
+            .collect();
+        let differs = |a: usize, b: usize| {
+            let ((ga, ta), va) = &first[a];
+            let ((gb, tb), vb) = &first[b];
+            let step = |x: f64, y: f64| (x - y).abs() > 5.0;
+            ta != tb
+                || step(*ga, *gb)
+                || match (va, vb) {
+                    (None, None) => false,
+                    (Some(x), Some(y)) => x.2 != y.2 || step(x.1, y.1) || (x.0 - y.0).abs() > 4e-3,
+                    _ => true,
+                }
+        };
+        let mut fine = vec![false; w * h];
+        for y in 0..h {
+            for x in 0..w {
+                let i = y * w + x;
+                let mut mark = |j: usize| {
+                    if differs(i, j) {
+                        fine[i] = true;
+                        fine[j] = true;
+                    }
+                };
+                if x + 1 < w {
+                    mark(i + 1);
+                }
+                if y + 1 < h {
+                    mark(i + w);
+                    if x + 1 < w {
+                        mark(i + w + 1);
+                    }
+                    if x > 0 {
+                        mark(i + w - 1);
+                    }
+                }
+            }
+        }
+        for (i, _) in fine.iter().enumerate().filter(|(_, f)| **f) {
+            let (u, v) = ((i % w) as f64, (i / w) as f64);
+            let c = ray(u, v);
+            let (du, dv) = ((ray(u + 0.5, v) - ray(u - 0.5, v)), (ray(u, v + 0.5) - ray(u, v - 0.5)));
+            let (mut back, mut grey, mut cover, mut depth) = (0.0, 0.0, 0.0, f64::INFINITY);
+            for k in 0..FINE * FINE {
+                let (a, b) = ((k % FINE) as f64, (k / FINE) as f64);
+                let n = FINE as f64;
+                // Each row of samples is shifted a little, so that no straight edge runs along a column of them.
+                let a = (a + 0.5 + (b + 0.5) / n - 0.5) / n - 0.5;
+                let b = (b + 0.5) / n - 0.5;
+                let d = (object_from_camera.rotation * (c + du * a + dv * b)).normalize();
+                back += stage.backdrop(&o, &d).0;
+                if let Some((t, g, _)) = stage.valve(&o, &d) {
+                    grey += g;
+                    cover += 1.0;
+                    depth = depth.min(t);
+                }
+            }
+            let n = (FINE * FINE) as f64;
+            backdrop[i] = (back / n) as f32;
+            valve[i] = [(grey / n) as f32, (cover / n) as f32, depth as f32];
+        }
+        drop(first);
+        for (i, f) in falloff.iter().enumerate() {
+            backdrop[i] *= f;
+            valve[i][0] *= f;
+        }
+        let touched = (0..w * h).filter(|i| valve[*i][1] > 0.0).map(|i| Pixel::new((i % w) as f64, (i / w) as f64));
+        let valve_rect = Rect::around(touched, 0.0, w, h).unwrap_or(Rect { x0: 0, y0: 0, x1: 1, y1: 1 });
+        let mut inside = Vec::with_capacity(valve_rect.width() * valve_rect.height());
+        let mut rays = Vec::with_capacity(inside.capacity());
+        for y in valve_rect.y0..valve_rect.y1 {
+            for x in valve_rect.x0..valve_rect.x1 {
+                inside.push(valve[y * w + x]);
+                rays.push(ray(x as f64, y as f64));
+            }
+        }
+        let mut layers = Self {
+            width: w,
+            height: h,
+            backdrop,
+            valve_rect,
+            valve: inside,
+            rays,
+            falloff,
+            exposed: (Vec::new(), Vec::new()),
+        };
+        layers.expose(sensor);
+        layers
+    }
+
+    /// Grey of the fixed scene at a pixel, not blurred.
+    pub(super) fn still(&self, x: usize, y: usize) -> f32 {
+        let b = self.backdrop[y * self.width + x];
+        match self.valve_at(x, y) {
+            Some((v, _)) => v[0] + (1.0 - v[1]) * b,
+            None => b,
+        }
+    }
+
+    /// Valve layer and ray at a pixel, where the valve could be.
+    #[inline]
+    pub(super) fn valve_at(&self, x: usize, y: usize) -> Option<(&[f32; 3], &Vec3)> {
+        let r = &self.valve_rect;
+        if x < r.x0 || x >= r.x1 || y < r.y0 || y >= r.y1 {
+            return None;
+        }
+        let i = (y - r.y0) * r.width() + (x - r.x0);
+        Some((self.valve.get(i)?, self.rays.get(i)?))
+    }
+
+    fn expose(&mut self, sensor: &Sensor) {
+        let (w, h) = (self.width, self.height);
+        let all = Rect { x0: 0, y0: 0, x1: w, y1: h };
+        let mut picture: Vec<f32> = (0..w * h).map(|i| self.still(i % w, i / w)).collect();
+        let mut scratch = Vec::new();
+        blur(&mut picture, all.width(), &sensor.kernel(), &mut scratch);
+        self.exposed.0 = picture.iter().map(|g| (g * SCALE).clamp(0.0, 20_000.0) as i16).collect();
+        self.exposed.1 = picture.iter().map(|g| sensor.amplitude(*g)).collect();
+    }
+}
+
+/// Blurs a picture of rows of `width` in place with a symmetric kernel (centre first); borders repeat.
+pub(super) fn blur(picture: &mut [f32], width: usize, kernel: &[f32], scratch: &mut Vec<f32>) {
+    let n = kernel.len() - 1;
+    if n == 0 || width == 0 {
+        return;
+    }
+    let height = picture.len() / width;
+    // Rows, through a padded copy of each.
+    scratch.clear();
+    scratch.resize(width + 2 * n, 0.0);
+    for row in picture.chunks_exact_mut(width) {
+        scratch[..n].fill(row[0]);
+        scratch[n..n + width].copy_from_slice(row);
+        scratch[n + width..].fill(row[width - 1]);
+        for (x, o) in row.iter_mut().enumerate() {
+            *o = kernel[0] * scratch[x + n];
+        }
+        for (k, c) in kernel.iter().enumerate().skip(1) {
+            let (a, b) = (&scratch[n - k..], &scratch[n + k..]);
+            for ((o, a), b) in row.iter_mut().zip(a).zip(b) {
+                *o += c * (a + b);
+            }
+        }
+    }
+    // Columns, row by row: a ring would save memory, a copy is simpler and as fast.
+    scratch.clear();
+    scratch.extend_from_slice(picture);
+    for y in 0..height {
+        let out = &mut picture[y * width..(y + 1) * width];
+        let src = |y: isize| {
+            let y = y.clamp(0, height as isize - 1) as usize;
+            &scratch[y * width..(y + 1) * width]
+        };
+        for (o, a) in out.iter_mut().zip(src(y as isize)) {
+            *o = kernel[0] * a;
+        }
+        for (k, c) in kernel.iter().enumerate().skip(1) {
+            let (a, b) = (src(y as isize - k as isize), src(y as isize + k as isize));
+            for ((o, a), b) in out.iter_mut().zip(a).zip(b) {
+                *o += c * (a + b);
+            }
+        }
+    }
+}
