@@ -118,6 +118,80 @@ fn with_half_of_the_marks_hidden_it_is_mostly_found_and_never_wrongly() {
 }
 
 #[test]
+fn small_and_large_marks_are_found_alike() {
+    // Marks of about 7, 12, 30 and 44 px across.
+    let (rig, gripper) = (rig(true), gripper());
+    let mut scratch = scratch();
+    let mut random = Random(8);
+    let none = Gripper { marks: heapless::Vec::new(), flange_from_gripper: Pose::identity() };
+    for z in [3.6, 2.2, 0.9, 0.6] {
+        for n in 0..5 {
+            // Near by, the two views share only what is half way between the cameras.
+            let mut truth = pose_at(&mut random, 0.4, z);
+            if z < 1.0 {
+                truth.translation.vector.x = 0.25;
+            }
+            let pair = scene(&mut random, &rig, &gripper, &truth, &none, &[], 8);
+            let a = run(&rig, &gripper, &pair, &mut scratch);
+            let (mm, deg) = a.map(|a| error(&truth, &a.left_from_gripper)).unwrap_or((f64::NAN, f64::NAN));
+            let at = truth.translation.vector;
+            assert!(mm < 1.0 * z && deg < 0.5, "{z} m, scene {n} at {at:?}: {mm} mm {deg} deg, {a:?}");
+        }
+    }
+}
+
+#[test]
+fn a_rig_that_was_knocked_is_still_enough_to_find_the_gripper() {
+    // Focal length wrong by 0.5 %, relative rotation by 0.1 degrees: what product.md wants survived.
+    let (true_rig, gripper) = (rig(true), gripper());
+    let mut scratch = scratch();
+    let mut random = Random(9);
+    for n in 0..10 {
+        let mut wrong = true_rig;
+        for c in [&mut wrong.left, &mut wrong.right] {
+            let f = 1.0 + random.range(-0.005, 0.005);
+            (c.fx, c.fy) = (c.fx * f, c.fy * f);
+        }
+        wrong.right_from_left.rotation = nudge(&mut random, 0.0, 0.1).rotation * wrong.right_from_left.rotation;
+        let truth = pose(&mut random, 0.5);
+        let others = clutter(&mut random, 8);
+        let pair = scene(&mut random, &true_rig, &gripper, &truth, &others, &[], 8);
+        let a = run(&wrong, &gripper, &pair, &mut scratch).unwrap_or_else(|e| panic!("scene {n}: {e:?}"));
+        let (mm, deg) = error(&truth, &a.left_from_gripper);
+        assert!(mm < 20.0 && deg < 3.0, "scene {n}: {mm} mm {deg} deg");
+        let mut cycle = VisionCycle::new(wrong, gripper.clone(), VisionSettings::default());
+        cycle.seed(a.left_from_gripper);
+        let v = cycle.step(&pair.frame(1), None).unwrap();
+        assert_eq!(v.status, VisionStatus::Tracking, "scene {n}");
+        assert!(v.seen.iter().all(|s| *s >= 12), "scene {n}: {:?}, residual {} px", v.seen, v.residual_px);
+    }
+}
+
+#[test]
+fn five_marks_are_enough_and_three_are_not() {
+    let (rig, gripper) = (rig(true), gripper());
+    let mut scratch = scratch();
+    let mut random = Random(10);
+    let mut found = 0;
+    for n in 0..20 {
+        let truth = pose(&mut random, 0.4);
+        let others = clutter(&mut random, 12);
+        let shown = if n < 10 { 5 } else { 3 };
+        let mut hidden: Vec<usize> = (0..16).collect();
+        for _ in 0..shown {
+            hidden.swap_remove((random.bits() % hidden.len() as u64) as usize);
+        }
+        let pair = scene(&mut random, &rig, &gripper, &truth, &others, &hidden, 6);
+        if let Ok(a) = run(&rig, &gripper, &pair, &mut scratch) {
+            let (mm, deg) = error(&truth, &a.left_from_gripper);
+            assert!(shown == 5 && mm < 2.0 && deg < 1.5, "scene {n}: {shown} shown, {mm} mm {deg} deg, {a:?}");
+            found += 1;
+        }
+    }
+    assert!(found >= 8, "{found} of 10");
+}
+
+#[test]
 fn clutter_alone_is_not_a_gripper() {
     let (rig, gripper) = (rig(true), gripper());
     let mut scratch = scratch();

@@ -32,6 +32,9 @@ pub struct VisionSettings {
     pub max_sigma: f64,
     /// Largest residual of the used marks, pixels; above it this is not the gripper. Default 3.
     pub max_residual_px: f64,
+    /// Fewest different marks that make a pose worth having: three determine one, but then nothing says that one of them is wrong.
+    /// Default 4.
+    pub min_marks: usize,
     /// Frames over which lost marks are looked for at the prediction before an acquisition is needed. Default 5.
     pub coast_frames: u32,
 }
@@ -47,6 +50,7 @@ impl Default for VisionSettings {
             jump_margin: 0.004,
             max_sigma: 0.005,
             max_residual_px: 3.0,
+            min_marks: 4,
             coast_frames: 5,
         }
     }
@@ -149,7 +153,8 @@ impl VisionCycle {
     /// Tracks one stereo pair.
     ///
     /// `prior` is `left_from_gripper` at capture as predicted from the last pose and the joints' motion since; without it the
-    /// track's own velocity is used. It is ignored straight after a seed, and when it contradicts the last pose.
+    /// track's own velocity is used. It is ignored straight after a seed, and when it contradicts the last pose. A result with status
+    /// [`VisionStatus::Lost`] has no marks, a pose that means nothing, and a covariance of a million.
     ///
     /// # Errors
     /// [`FrameReject`] when the pair, or the pose found in it, is not to be believed. The caller publishes nothing then, so that the
@@ -251,7 +256,8 @@ impl VisionCycle {
         self.faults.outliers += dropped;
         let worst = (0..3).map(|i| best.covariance[(i, i)]).fold(0.0, f64::max);
         let s = &self.settings;
-        (worst <= s.max_sigma * s.max_sigma && best.residual_px <= s.max_residual_px).then_some(best)
+        let sound = best.distinct() >= s.min_marks && best.residual_px <= s.max_residual_px;
+        (sound && worst <= s.max_sigma * s.max_sigma).then_some(best)
     }
 
     /// Whether a gripper can get from `a` to `b` in `dt` seconds; else how far it is.

@@ -306,6 +306,14 @@ pub fn pose(random: &mut Random, tilt: f64) -> Pose {
     Pose::from_parts(t.into(), tip.rotation * spin.rotation)
 }
 
+/// A pose as [`pose`] gives, moved along the line of sight to another distance.
+pub fn pose_at(random: &mut Random, tilt: f64, z: f64) -> Pose {
+    let mut p = pose(random, tilt);
+    let t = &mut p.translation.vector;
+    *t = Vec3::new(0.25 + (t.x - 0.25) * z / 1.5, t.y * z / 1.5, z);
+    p
+}
+
 pub struct Pair {
     pub left: Vec<u8>,
     pub right: Vec<u8>,

@@ -16,6 +16,8 @@ pub(crate) struct MatchLimits {
     pub(crate) tolerance: f64,
     /// Distance tolerance, share of the distance.
     pub(crate) relative: f64,
+    /// Distance tolerance by the square of the depth, 1/m: what a blob's few tenths of a pixel make of a point far away.
+    pub(crate) depth: f64,
     /// Factor by which a radius may differ.
     pub(crate) size_factor: f64,
     /// Triples compared at most.
@@ -73,8 +75,9 @@ impl Search<'_> {
         m.dark == p.dark && p.radius < m.radius * f && p.radius * f > m.radius
     }
 
-    fn slack(&self, d: f64) -> f64 {
-        self.limits.tolerance + self.limits.relative * d
+    /// Tolerance of a distance `d` between points at depth `z`.
+    fn slack(&self, d: f64, z: f64) -> f64 {
+        self.limits.tolerance + self.limits.relative * d + self.limits.depth * z * z
     }
 
     fn facing(&self, pose: &Pose, m: &Mark) -> bool {
@@ -92,7 +95,7 @@ impl Search<'_> {
             }
             let x = (pose * nalgebra::Point3::from(m.position)).coords;
             // A triangle's own error grows towards its far side, hence one and a half times the distance's slack.
-            let reach = 1.5 * self.slack(0.1);
+            let reach = 1.5 * self.slack(0.1, x.z);
             let mut best: Option<(usize, f64)> = None;
             for (i, p) in self.points.iter().enumerate() {
                 let d2 = (p.position - x).norm_squared();
@@ -143,8 +146,9 @@ pub(crate) fn find(
         }
     }
     let span = math::sqrt(span);
-    let reach = span + s.slack(span);
     for (ip, p) in points.iter().enumerate() {
+        let z = p.position.z;
+        let reach = span + s.slack(span, z);
         // The points that may belong to one gripper with p: gathered once, so that the inner loops are short.
         let mut near: heapless::Vec<(usize, f64), MAX_POINTS> = heapless::Vec::new();
         for (iq, q) in points.iter().enumerate().skip(ip + 1) {
@@ -162,7 +166,7 @@ pub(crate) fn find(
                 let Some(q) = points.get(iq) else { continue };
                 for (mj, j) in gripper.marks.iter().enumerate() {
                     let ij = math::sqrt((j.position - i.position).norm_squared());
-                    if mj == mi || math::fabs(ij - pq) > s.slack(ij) || !s.like(j, q) {
+                    if mj == mi || math::fabs(ij - pq) > s.slack(ij, z) || !s.like(j, q) {
                         continue;
                     }
                     for &(ir, pr) in near.iter().skip(n + 1) {
@@ -190,6 +194,7 @@ fn third(
     qr: f64,
     found: &mut heapless::Vec<Hypothesis, MAX_HYPOTHESES>,
 ) {
+    let z = p.position.z;
     let (Some(i), Some(j)) = (s.gripper.marks.get(mi).copied(), s.gripper.marks.get(mj).copied()) else { return };
     for mk in 0..s.gripper.marks.len() {
         let Some(k) = s.gripper.marks.get(mk).copied() else { continue };
@@ -197,11 +202,11 @@ fn third(
             continue;
         }
         let ik = math::sqrt((k.position - i.position).norm_squared());
-        if math::fabs(ik - pr) > s.slack(ik) {
+        if math::fabs(ik - pr) > s.slack(ik, z) {
             continue;
         }
         let jk = math::sqrt((k.position - j.position).norm_squared());
-        if math::fabs(jk - qr) > s.slack(jk) {
+        if math::fabs(jk - qr) > s.slack(jk, z) {
             continue;
         }
         let from = [i.position, j.position, k.position];

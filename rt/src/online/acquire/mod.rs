@@ -173,7 +173,10 @@ pub fn acquire(
     if scratch.points.len() < 4 {
         return Err(AcquireFailure::TooFewPairs { found: scratch.points.len() as u16 });
     }
+    let baseline = rig.centre(View::Right).norm_squared();
     let match_limits = MatchLimits {
+        // Three tenths of a pixel between the two views.
+        depth: 0.3 / (rig.left.fx * crate::math::sqrt(baseline)).max(1.0),
         tolerance: settings.distance[0],
         relative: settings.distance[1],
         size_factor,
