@@ -3,6 +3,7 @@
 //! `graspd run` is the real-time daemon (two real-time threads, [`realtime`] and [`threads`]); every other subcommand is an ordinary
 //! program that shares its files and formats.
 
+pub mod arm;
 pub mod cli;
 pub mod config;
 pub mod exit;

@@ -190,6 +190,11 @@ impl Session {
         self.phase
     }
 
+    /// Whether an answer of the handshake is awaited: then [`transmit`](Session::transmit) has nothing to say.
+    pub fn is_awaiting(&self) -> bool {
+        self.awaiting
+    }
+
     /// Protocol version of the connection.
     pub fn version(&self) -> Version {
         self.version

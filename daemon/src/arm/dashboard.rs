@@ -1,0 +1,90 @@
+//! Dashboard client: one line out, one line back.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use super::ur_config::{ArmError, Port, UrConfig};
+
+/// The longest line that is read; the controller's are far shorter.
+const MAX_LINE: u64 = 4096;
+
+/// A connection to the dashboard server (port 29999; PolyScope 3 and 5).
+#[derive(Debug)]
+pub struct Dashboard {
+    stream: BufReader<TcpStream>,
+    timeout: Duration,
+}
+
+impl Dashboard {
+    /// Connects and reads the greeting.
+    pub fn open(config: &UrConfig) -> Result<Dashboard, ArmError> {
+        let stream = config.open(Port::Dashboard)?;
+        let mut dashboard = Dashboard { stream: BufReader::new(stream), timeout: config.timeout };
+        dashboard.line()?;
+        Ok(dashboard)
+    }
+
+    /// Sends a command and gives its answer without the line's end.
+    pub fn ask(&mut self, command: &str) -> Result<String, ArmError> {
+        let line = format!("{command}\n");
+        self.stream.get_mut().write_all(line.as_bytes()).map_err(io)?;
+        self.line()
+    }
+
+    /// Sends a command whose answer must start with one of these words, in any case.
+    pub fn demand(&mut self, command: &str, success: &[&str]) -> Result<String, ArmError> {
+        let answer = self.ask(command)?;
+        let lower = answer.to_ascii_lowercase();
+        if success.iter().any(|s| lower.starts_with(&s.to_ascii_lowercase())) {
+            Ok(answer)
+        } else {
+            Err(ArmError::Dashboard { command: command.to_owned(), answer })
+        }
+    }
+
+    /// Asks again and again until the answer contains `wanted`.
+    pub fn wait_for(&mut self, command: &'static str, wanted: &str, limit: Duration) -> Result<String, ArmError> {
+        let start = Instant::now();
+        loop {
+            let answer = self.ask(command)?;
+            if answer.to_ascii_uppercase().contains(wanted) {
+                return Ok(answer);
+            }
+            if start.elapsed() >= limit {
+                return Err(ArmError::Dashboard { command: command.to_owned(), answer });
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    }
+
+    /// One line, bounded in length and in time however slowly it drips.
+    fn line(&mut self) -> Result<String, ArmError> {
+        let deadline = Instant::now() + self.timeout;
+        let mut line = Vec::new();
+        while !line.ends_with(b"\n") {
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() || line.len() as u64 >= MAX_LINE {
+                return Err(ArmError::Timeout { what: "dashboard answer", seconds: self.timeout.as_secs_f64() });
+            }
+            self.stream.get_ref().set_read_timeout(Some(left)).map_err(io)?;
+            // `fill_buf` reads once; `read_until` alone would go on as long as bytes drip in.
+            let available = self.stream.fill_buf().map_err(io)?;
+            if available.is_empty() {
+                return Err(io(std::io::ErrorKind::UnexpectedEof.into()));
+            }
+            let n = available.len() as u64;
+            self.stream.by_ref().take(n).read_until(b'\n', &mut line).map_err(io)?;
+        }
+        Ok(String::from_utf8_lossy(&line).trim_end().to_owned())
+    }
+}
+
+fn io(source: std::io::Error) -> ArmError {
+    match source.kind() {
+        std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut => {
+            ArmError::Timeout { what: "dashboard answer", seconds: 0.0 }
+        }
+        _ => ArmError::Io { service: Port::Dashboard, source },
+    }
+}

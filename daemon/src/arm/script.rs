@@ -1,0 +1,127 @@
+//! The control script: filled in, uploaded, stopped.
+
+use std::io::{Read, Write};
+use std::time::Duration;
+
+use super::dashboard::Dashboard;
+use super::ur_config::{ArmError, Port, UrConfig};
+
+/// The script with its {{...}} still open; docs/RTDE-REGISTERS.md explains it.
+const TEMPLATE: &str = include_str!("../../dist/graspd_control.script");
+
+/// Joint angle that position mode may be ahead of the joint, rad: what `servoj` lags at full speed, with a margin.
+const POSITION_STEP: f64 = 0.25;
+
+/// How long a fresh script waits for the command thread, s.
+const HANDSHAKE_S: f64 = 10.0;
+
+/// Fills in the control script. `step_s` is the controller's step: 0.002 on e-Series, 0.008 on CB3.
+///
+/// # Errors
+/// A limit that is not a positive number: it would be written into the script as it stands.
+pub fn render(config: &UrConfig, token: i32, step_s: f64) -> Result<String, ArmError> {
+    let positive = |key, value: f64, max: f64| {
+        if value > 0.0 && value <= max {
+            Ok(value)
+        } else {
+            Err(ArmError::Setting { key, value, fix: "must be positive and within the arm's own limit" })
+        }
+    };
+    for (limit, range) in config.speed_limits.iter().zip(config.model.joints()) {
+        positive("speed limit", *limit, range.speed + 1e-9)?;
+    }
+    positive("acceleration", config.acceleration, 40.0)?;
+    positive("stop acceleration", config.stop_acceleration, 40.0)?;
+    positive("loop.rate_hz", config.beat_hz, 1000.0)?;
+    positive("arm.watchdog_ms", config.watchdog_ms, 1000.0)?;
+    // The script's own patience ends before the controller's watchdog, and never within two and a half beats of a slow loop.
+    let patience_s = 0.020f64.max(2.5 / config.beat_hz);
+    let watchdog_s = (config.watchdog_ms * 1e-3).max(patience_s + 2.0 * step_s);
+    let limits: Vec<String> = config.speed_limits.iter().map(|v| format!("{v:.6}")).collect();
+    let filled = [
+        ("{{TOKEN}}", token.to_string()),
+        ("{{SPEED_LIMITS}}", format!("[{}]", limits.join(", "))),
+        ("{{ACCELERATION_LIMIT}}", format!("{:.6}", config.acceleration)),
+        ("{{STOP_ACCELERATION}}", format!("{:.6}", config.stop_acceleration)),
+        ("{{POSITION_STEP}}", format!("{POSITION_STEP:.6}")),
+        ("{{PATIENCE_STEPS}}", format!("{}", (patience_s / step_s).ceil() as u32)),
+        ("{{HANDSHAKE_STEPS}}", format!("{}", (HANDSHAKE_S / step_s).ceil() as u32)),
+        ("{{WATCHDOG_HZ}}", format!("{:.3}", 1.0 / watchdog_s)),
+        ("{{LOOKAHEAD}}", "0.03".to_owned()),
+        ("{{GAIN}}", "1000".to_owned()),
+    ];
+    Ok(filled.into_iter().fold(TEMPLATE.to_owned(), |text, (key, value)| text.replace(key, &value)))
+}
+
+/// Uploads the control script to the secondary interface. It replaces a program that runs, and then waits for the command
+/// thread's handshake; nothing moves by this.
+///
+/// # Errors
+/// No connection, local control, or a setting that cannot be.
+pub fn start_script(config: &UrConfig, token: i32, step_s: f64) -> Result<(), ArmError> {
+    let text = render(config, token, step_s)?;
+    // In local control an e-Series takes the bytes and drops them. CB3 does not know the question; a controller without a
+    // dashboard (PolyScope X) is not asked.
+    if let Ok(mut dashboard) = Dashboard::open(config)
+        && dashboard.ask("is in remote control").is_ok_and(|answer| answer.trim().eq_ignore_ascii_case("false"))
+    {
+        return Err(ArmError::LocalControl);
+    }
+    upload(config, &text)
+}
+
+/// Stops whatever program runs, by a program that does nothing but stop the joints.
+pub fn stop_script(config: &UrConfig) -> Result<(), ArmError> {
+    upload(config, &format!("def graspd_stop():\n  stopj({:.3})\nend\n", config.stop_acceleration))
+}
+
+/// Sends a script. The connection is read for a moment before it is closed: closing with unread state in the receive buffer
+/// resets it, and a reset may overtake the script.
+fn upload(config: &UrConfig, text: &str) -> Result<(), ArmError> {
+    let fail = |source| ArmError::Io { service: Port::Secondary, source };
+    let mut stream = config.open(Port::Secondary)?;
+    stream.write_all(text.as_bytes()).map_err(fail)?;
+    // The controller does not start a last line without its end.
+    stream.write_all(b"\n").map_err(fail)?;
+    stream.shutdown(std::net::Shutdown::Write).map_err(fail)?;
+    stream.set_read_timeout(Some(Duration::from_millis(100))).map_err(fail)?;
+    let mut sink = [0u8; 4096];
+    for _ in 0..3 {
+        if !matches!(stream.read(&mut sink), Ok(n) if n > 0) {
+            break;
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use graspd_rt::arm::Model;
+
+    #[test]
+    fn everything_is_filled_in() {
+        let text = render(&UrConfig::new("localhost", Model::Ur5e), 77, 0.002).unwrap();
+        assert!(!text.replace("The daemon fills in the {{...}}", "").contains("{{"), "{text}");
+        assert!(text.contains("TOKEN = 77") && text.contains("PATIENCE_STEPS = 10"));
+        assert!(text.contains("rtde_set_watchdog(\"input_int_register_25\", 20.000, \"stop\")"));
+        assert!(text.is_ascii() && !text.contains('\t'));
+    }
+
+    #[test]
+    fn a_slow_loop_gets_more_patience_and_the_watchdog_stays_behind_it() {
+        let config = UrConfig { beat_hz: 50.0, ..UrConfig::new("localhost", Model::Ur5) };
+        let text = render(&config, 1, 0.008).unwrap();
+        assert!(text.contains("PATIENCE_STEPS = 7"));
+        assert!(text.contains("15.152"), "watchdog at patience and two steps");
+    }
+
+    #[test]
+    fn limits_that_cannot_be_are_refused() {
+        for bad in [f64::NAN, 0.0, -1.0, f64::INFINITY, 4.0] {
+            let mut config = UrConfig::new("localhost", Model::Ur5e);
+            config.speed_limits[2] = bad;
+            assert!(matches!(render(&config, 1, 0.002), Err(ArmError::Setting { .. })), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,201 @@
+//! What must be known to talk to a UR controller, and what can go wrong.
+
+use std::io;
+use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
+use std::time::Duration;
+
+use graspd_rt::arm::{Joints, Model};
+use graspd_rt::rtde::ClientError;
+
+/// A service of the controller.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u16)]
+pub enum Port {
+    /// Text commands.
+    Dashboard = 29999,
+    /// State and messages at 10 Hz.
+    Primary = 30001,
+    /// State at 10 Hz; scripts are uploaded here.
+    Secondary = 30002,
+    /// Real-time data exchange.
+    Rtde = 30004,
+}
+
+/// How motion is asked for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Motion {
+    /// `speedj`.
+    #[default]
+    Velocity,
+    /// `servoj`, by integrating the rates; adds about its lookahead (30 ms and more) as delay.
+    Position,
+}
+
+/// A UR controller and how to use it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct UrConfig {
+    /// Host name or address.
+    pub address: String,
+    /// Added to every port; 0 on a real robot.
+    pub port_offset: u16,
+    /// The model that the configuration states.
+    pub model: Model,
+    /// State packages a second; the controller's maximum when `None`.
+    pub frequency_hz: Option<f64>,
+    /// Beat of the command thread, Hz: the script's patience follows from it.
+    pub beat_hz: f64,
+    /// How motion is asked for.
+    pub motion: Motion,
+    /// Speed that the script refuses to exceed, each joint, rad/s.
+    pub speed_limits: Joints,
+    /// Acceleration of `speedj`, rad/s2.
+    pub acceleration: f64,
+    /// Deceleration of every stop, rad/s2.
+    pub stop_acceleration: f64,
+    /// The controller stops the program when no command came for this long, ms.
+    pub watchdog_ms: f64,
+    /// How long connecting and each answer may take.
+    pub timeout: Duration,
+}
+
+impl UrConfig {
+    /// Usual values for a model at an address: 500 Hz beat, the model's speeds, 50 ms watchdog.
+    pub fn new(address: impl Into<String>, model: Model) -> UrConfig {
+        UrConfig {
+            address: address.into(),
+            port_offset: 0,
+            model,
+            frequency_hz: None,
+            beat_hz: 500.0,
+            motion: Motion::Velocity,
+            speed_limits: model.joints().map(|r| r.speed),
+            acceleration: 10.0,
+            stop_acceleration: 10.0,
+            watchdog_ms: 50.0,
+            timeout: Duration::from_secs(5),
+        }
+    }
+
+    /// Opens a TCP connection to a service, within the timeout.
+    pub(super) fn open(&self, port: Port) -> Result<TcpStream, ArmError> {
+        let number = (port as u16).wrapping_add(self.port_offset);
+        let fail = |source| ArmError::Connect { address: self.address.clone(), port: number, source };
+        let mut last = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
+        let found: Vec<SocketAddr> = (self.address.as_str(), number).to_socket_addrs().map_err(fail)?.collect();
+        for address in found {
+            match TcpStream::connect_timeout(&address, self.timeout) {
+                Ok(stream) => {
+                    let ready = stream
+                        .set_nodelay(true)
+                        .and_then(|()| stream.set_read_timeout(Some(self.timeout)))
+                        .and_then(|()| stream.set_write_timeout(Some(self.timeout)));
+                    return ready.map(|()| stream).map_err(fail);
+                }
+                Err(e) => last = e,
+            }
+        }
+        Err(fail(last))
+    }
+}
+
+/// What goes wrong between the daemon and a controller, outside the real-time path.
+#[derive(Debug, thiserror::Error)]
+pub enum ArmError {
+    /// No connection.
+    #[error("cannot reach {address}:{port}: {source}; check the cable, arm.address and that the controller is on")]
+    Connect {
+        /// Configured address.
+        address: String,
+        /// Port number.
+        port: u16,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// A connection ended or failed while in use.
+    #[error("{service:?} connection failed: {source}")]
+    Io {
+        /// The service.
+        service: Port,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// No answer in time.
+    #[error("no {what} from the controller within {seconds:.1} s")]
+    Timeout {
+        /// What was waited for.
+        what: &'static str,
+        /// How long.
+        seconds: f64,
+    },
+    /// The session could not be set up.
+    #[error("RTDE: {0}")]
+    Session(#[from] ClientError),
+    /// The stream is not RTDE.
+    #[error("RTDE: {0}; is this port really RTDE?")]
+    Framing(#[from] graspd_rt::rtde::FrameError),
+    /// Another program runs on the robot.
+    #[error("another program runs on the robot; stop it on the pendant, or run `graspd recover`")]
+    ProgramRunning,
+    /// Scripts are taken in remote control only.
+    #[error("the robot is in local control and takes no script; switch it to Remote Control on the pendant")]
+    LocalControl,
+    /// The robot cannot run a program now.
+    #[error(
+        "the robot is not ready: robot_mode {mode} (7 is running), safety_status_bits {safety:#x}; run `graspd recover`"
+    )]
+    NotReady {
+        /// `robot_mode`.
+        mode: i32,
+        /// `safety_status_bits`.
+        safety: u32,
+    },
+    /// The uploaded script does not answer.
+    #[error("the control script did not start within {seconds:.1} s: {hint}")]
+    NoScript {
+        /// How long was waited.
+        seconds: f64,
+        /// What the controller said, or what to look at.
+        hint: String,
+    },
+    /// The robot runs another version of the script.
+    #[error("the control script answers as version {found}, this daemon speaks {expected}")]
+    ScriptVersion {
+        /// What the script says.
+        found: i32,
+        /// What is needed.
+        expected: i32,
+    },
+    /// It is another kind of arm.
+    #[error("the configuration says {expected}, but the controller reports {found}; set arm.model")]
+    WrongModel {
+        /// From the configuration.
+        expected: &'static str,
+        /// From the controller.
+        found: String,
+    },
+    /// A dashboard command was refused.
+    #[error("dashboard refused `{command}`: {answer}")]
+    Dashboard {
+        /// What was asked.
+        command: String,
+        /// What was answered.
+        answer: String,
+    },
+    /// A setting cannot be.
+    #[error("{key} = {value}: {fix}")]
+    Setting {
+        /// The setting.
+        key: &'static str,
+        /// Its value.
+        value: f64,
+        /// What it must be.
+        fix: &'static str,
+    },
+}
+
+/// A session token that no earlier session had, as far as a clock can tell: never 0, which is what unused registers hold.
+pub fn fresh_token() -> i32 {
+    let nanos = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_nanos() as u64);
+    let mixed = (nanos ^ u64::from(std::process::id()).rotate_left(40)).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    ((mixed >> 33) as i32 & 0x7fff_ffff).max(1)
+}
