@@ -122,6 +122,9 @@ impl StateReader {
     /// uses them checks that they are finite and plausible.
     #[inline]
     pub fn read(&self, values: &[u8], received_ns: u64) -> Option<RobotState> {
+        if values.len() < self.size {
+            return None;
+        }
         let [q, qd, target_q, target_qd] = &self.vectors;
         let [safety, status, runtime] = &self.words;
         let [scaling, fraction] = &self.scales;
