@@ -1,5 +1,6 @@
 //! The simulated world.
 
+pub mod controller;
 pub mod plant;
 pub mod scenario;
 pub mod scene;

@@ -227,6 +227,13 @@ impl Generator {
         (self.q, self.qd, self.qdd, self.active) = (q, [0.0; 6], [0.0; 6], Active::Rest);
     }
 
+    /// Brings a move to rest half way; speed and servo motions go on.
+    pub fn abandon_move(&mut self) {
+        if matches!(self.active, Active::Joint { .. } | Active::Tool { .. } | Active::Brake(_, Some(_))) {
+            self.active = Active::Brake(4.0, None);
+        }
+    }
+
     /// Whether the motion has reached what it wanted: the end, rest, or the speed asked for.
     pub fn is_settled(&self) -> bool {
         match &self.active {

@@ -1,0 +1,97 @@
+//! What the controller has to say on the primary interface.
+
+/// Text of a message is cut to this many bytes.
+const LONGEST_TEXT: usize = 2048;
+/// Messages that wait for the next send; older ones are dropped first.
+const MOST_WAITING: usize = 256;
+
+/// One robot message.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Message {
+    /// Controller time, microseconds.
+    pub time_us: u64,
+    /// What it says.
+    pub kind: MessageKind,
+}
+
+/// What a message says.
+#[derive(Clone, Debug, PartialEq)]
+pub enum MessageKind {
+    /// `textmsg`.
+    Text(String),
+    /// The program's position in words.
+    Label(i32, String),
+    /// `popup`.
+    Popup {
+        /// Head line.
+        title: String,
+        /// Body.
+        text: String,
+        /// Shown in yellow.
+        warning: bool,
+        /// Shown in red.
+        error: bool,
+    },
+    /// The safety mode changed.
+    Safety {
+        /// Code of the report, `C<code>A<argument>`.
+        code: i32,
+        /// Argument of the code.
+        argument: i32,
+        /// New `safety_mode`.
+        mode: u8,
+    },
+    /// A coded error.
+    Error {
+        /// Code of the report, `C<code>A<argument>`.
+        code: i32,
+        /// Argument of the code.
+        argument: i32,
+        /// 0 debug, 1 info, 2 warning, 3 violation, 4 fault.
+        level: i32,
+        /// In words.
+        text: String,
+    },
+    /// A program failed.
+    Runtime {
+        /// Line of the script, from 1.
+        line: i32,
+        /// Column, from 1.
+        column: i32,
+        /// In words.
+        text: String,
+    },
+}
+
+/// Messages that wait to be sent, bounded.
+#[derive(Clone, Debug, Default)]
+pub struct Outbox(std::collections::VecDeque<Message>);
+
+impl Outbox {
+    /// Adds a message, dropping the oldest when full.
+    pub fn push(&mut self, time_us: u64, kind: MessageKind) {
+        if self.0.len() == MOST_WAITING {
+            self.0.pop_front();
+        }
+        self.0.push_back(Message { time_us, kind });
+    }
+
+    /// Takes everything that waits.
+    pub fn drain(&mut self) -> impl Iterator<Item = Message> + '_ {
+        self.0.drain(..)
+    }
+
+    /// Whether nothing waits.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+}
+
+/// Cuts a text at a character boundary so that its length fits every frame.
+pub(super) fn cut(text: &str) -> &str {
+    let mut end = text.len().min(LONGEST_TEXT);
+    while !text.is_char_boundary(end) {
+        end -= 1;
+    }
+    &text[..end]
+}

@@ -1,0 +1,44 @@
+//! A Universal Robots controller as its clients see it.
+//!
+//! Layers, in the order a reader should learn them: [`Robot`] is the whole robot in memory, one control step a call; [`World`] adds
+//! the oracle ([`Judge`]), the wire record and the faults; [`Server`] puts it behind sockets. [`main_with_args`] is the program.
+//!
+//! The controller's half of the wire formats is written apart from the daemon's client, so that a mistake in one of them
+//! shows; only the table of variables is shared.
+
+mod cli;
+mod command;
+mod connection;
+mod dashboard;
+mod host;
+mod judge;
+mod link_faults;
+mod message;
+mod primary;
+mod program;
+mod record;
+mod registers;
+mod report;
+mod robot;
+mod rtde_session;
+mod script_stream;
+mod server;
+mod state;
+mod variables;
+mod watchdog;
+mod world;
+
+pub use cli::{Args, main_with_args};
+pub use command::{Command, Port, WireAction};
+pub use judge::{Episode, Judge, Limits, Rule, StepSample, Summary, Violation};
+pub use link_faults::{RtdeFaults, WireFaults};
+pub use message::{Message, MessageKind, Outbox};
+pub use program::Upload;
+pub use record::{Entry, RecordError, Recorder, judge as judge_record, read as read_record};
+pub use registers::{Registers, Signals};
+pub use report::{Report, ReportFault};
+pub use robot::{PROGRAM_STOP_DECEL, Payload, Robot, Setup};
+pub use rtde_session::{ClientId, InputPackage, Ownership, RtdeSession};
+pub use server::{ListenError, Server, now_ns};
+pub use state::{RobotMode, RuntimeState, SafetyMode};
+pub use world::World;

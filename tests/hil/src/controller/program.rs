@@ -1,0 +1,183 @@
+//! Programs on the controller: upload, play, pause, stop, and their turn in each control step.
+
+use super::message::MessageKind;
+use super::robot::{PROGRAM_STOP_DECEL, Robot};
+use super::state::{RobotMode, RuntimeState};
+use crate::plant::Motion;
+use crate::urscript::{Machine, StepOutcome};
+
+/// Programs side by side (`sec`); more are refused.
+const MOST_SECONDARY: usize = 8;
+
+/// The main program and those beside it.
+#[derive(Default)]
+pub(super) struct Programs {
+    main: Option<Machine>,
+    /// Whether the main program is under way; false as soon as it is ended, even from inside its own step.
+    active: bool,
+    secondary: Vec<Machine>,
+    /// Name and text of the program that `play` starts.
+    loaded: Option<(String, String)>,
+}
+
+/// What became of a text sent to ports 30001 to 30003.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Upload {
+    /// It replaces the main program.
+    Main,
+    /// It runs beside the main program.
+    Secondary,
+    /// Refused, with the reason that the robot shows.
+    Refused(String),
+}
+
+impl Robot {
+    /// Whether the main program is playing: bit 1 of `robot_status_bits`.
+    pub fn is_program_running(&self) -> bool {
+        matches!(self.runtime, RuntimeState::Playing | RuntimeState::Resuming)
+    }
+
+    /// Takes a script as ports 30001 to 30003 do: `def` replaces the main program, `sec` runs beside it, a bare line is a
+    /// program of one line.
+    pub fn upload(&mut self, text: &str) -> Upload {
+        let first = text.split_whitespace().next().unwrap_or("");
+        if text.trim() == "stop program" {
+            self.stop_program();
+            return Upload::Main;
+        }
+        let machine = match Machine::load(text) {
+            Ok(machine) => machine,
+            Err(e) => {
+                self.say(MessageKind::Runtime { line: e.line as i32, column: 1, text: e.message.clone() });
+                return Upload::Refused(e.to_string());
+            }
+        };
+        if first == "sec" {
+            if self.programs.secondary.len() >= MOST_SECONDARY {
+                return Upload::Refused("too many secondary programs".to_owned());
+            }
+            self.programs.secondary.push(machine);
+            return Upload::Secondary;
+        }
+        if !self.remote_control {
+            return Upload::Refused("the robot is in local control".to_owned());
+        }
+        if self.mode != RobotMode::Running || !self.safety.allows_motion() {
+            let text = format!("program refused: {} and {}", self.mode.name(), self.safety.name());
+            self.say(MessageKind::Error { code: 0, argument: 0, level: 2, text: text.clone() });
+            return Upload::Refused(text);
+        }
+        self.end_program();
+        (self.programs.main, self.programs.active) = (Some(machine), true);
+        self.runtime = RuntimeState::Playing;
+        Upload::Main
+    }
+
+    /// Loads `NAME.urp`, that is `NAME.script` of the program directory; false when there is none.
+    pub fn load_program(&mut self, name: &str) -> bool {
+        let stem = name.trim().trim_end_matches(".urp");
+        if stem.is_empty() || stem.contains(['/', '\\']) || stem.starts_with('.') {
+            return false;
+        }
+        let Some(directory) = &self.setup.programs else { return false };
+        match std::fs::read_to_string(directory.join(format!("{stem}.script"))) {
+            Ok(text) => {
+                self.programs.loaded = Some((format!("{stem}.urp"), text));
+                true
+            }
+            Err(_) => false,
+        }
+    }
+
+    /// Name of the loaded program.
+    pub fn loaded_program(&self) -> Option<&str> {
+        self.programs.loaded.as_ref().map(|(name, _)| name.as_str())
+    }
+
+    /// Starts the loaded program, or lets a paused one go on; false when neither can be.
+    pub fn play(&mut self) -> bool {
+        if self.mode != RobotMode::Running || !self.safety.allows_motion() {
+            return false;
+        }
+        if matches!(self.runtime, RuntimeState::Paused | RuntimeState::Pausing) && self.programs.active {
+            self.runtime = RuntimeState::Playing;
+            self.watchdogs.feed_all(self.clock_s);
+            return true;
+        }
+        let Some((_, text)) = self.programs.loaded.clone() else { return false };
+        self.upload(&text) == Upload::Main
+    }
+
+    /// Pauses the program; the arm comes to rest on its path. False when none plays.
+    pub fn pause_program(&mut self) -> bool {
+        let playing = self.is_program_running();
+        if playing {
+            self.runtime = RuntimeState::Pausing;
+        }
+        playing
+    }
+
+    /// Stops the program and brings the arm to rest.
+    pub fn stop_program(&mut self) {
+        if self.programs.active {
+            self.end_program();
+        }
+    }
+
+    /// Ends the main program: its motion, its watchdogs, its sockets.
+    pub(super) fn end_program(&mut self) {
+        self.watchdogs.clear();
+        self.sockets.close_all();
+        (self.motion_left_s, self.motion_failure) = (None, None);
+        self.programs.main = None;
+        if std::mem::take(&mut self.programs.active) {
+            self.generator.start(Motion::StopJ { decel: PROGRAM_STOP_DECEL });
+            self.runtime = RuntimeState::Stopping;
+        }
+    }
+
+    /// One step of every program.
+    pub(super) fn run_programs(&mut self) {
+        if self.is_program_running()
+            && let Some(mut main) = self.programs.main.take()
+        {
+            let outcome = main.step(self);
+            // The step may itself have ended the program (a protective stop): then it does not come back.
+            if self.programs.active {
+                self.programs.main = Some(main);
+                self.conclude(outcome);
+            }
+        }
+        let mut secondary = std::mem::take(&mut self.programs.secondary);
+        secondary.retain_mut(|machine| match machine.step(self) {
+            StepOutcome::Running => true,
+            StepOutcome::Finished => false,
+            StepOutcome::Failed(e) => {
+                self.say(MessageKind::Runtime { line: e.line as i32, column: 1, text: e.message });
+                false
+            }
+        });
+        self.programs.secondary = secondary;
+    }
+
+    fn conclude(&mut self, outcome: StepOutcome) {
+        match outcome {
+            StepOutcome::Running => {}
+            StepOutcome::Finished => self.end_program(),
+            StepOutcome::Failed(e) => {
+                self.say(MessageKind::Runtime { line: e.line as i32, column: 1, text: e.message });
+                self.end_program();
+            }
+        }
+    }
+
+    /// `Stopping` and `Pausing` end when the arm rests.
+    pub(super) fn settle_runtime(&mut self) {
+        let rest = self.generator.at_rest();
+        match self.runtime {
+            RuntimeState::Stopping if rest => self.runtime = RuntimeState::Stopped,
+            RuntimeState::Pausing if rest => self.runtime = RuntimeState::Paused,
+            _ => {}
+        }
+    }
+}

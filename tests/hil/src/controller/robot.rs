@@ -1,0 +1,409 @@
+//! The whole robot in memory: arm, safety, program, registers. No socket, no clock: [`Robot::step`] is one control step.
+
+use super::message::{MessageKind, Outbox};
+use super::program::Programs;
+use super::registers::{Registers, Signals};
+use super::report::{Report, ReportFault};
+use super::state::{RobotMode, RuntimeState, SafetyMode};
+use super::watchdog::Watchdogs;
+use crate::plant::{Drives, Generator, Joints, Kinematics, Model, StopCause};
+use crate::urscript::Popup;
+use nalgebra::Isometry3;
+
+/// Acceleration that the drives can give, rad/s^2.
+const DRIVE_ACCEL: f64 = 80.0;
+/// Deviation of a joint from its target that stops the arm, rad: Universal Robots' position tolerance of 5 degrees.
+const PATH_TOLERANCE: f64 = 0.087;
+/// Deceleration when a program ends or is stopped, rad/s^2: the same as the stop in Universal Robots' control script.
+pub const PROGRAM_STOP_DECEL: f64 = 4.0;
+
+/// What a robot is when it starts.
+#[derive(Clone, Debug)]
+pub struct Setup {
+    /// Which arm.
+    pub model: Model,
+    /// Its true kinematics; the model's nominal ones unless a unit's calibration is given.
+    pub kinematics: Kinematics,
+    /// Where it stands, rad.
+    pub start_joints: Joints,
+    /// Control steps a second.
+    pub rate_hz: f64,
+    /// Robot mode at the start: running, or switched off.
+    pub start_mode: RobotMode,
+    /// Controller time at the start, s. Above 40 s Universal Robots' C++ client does not wait for a boot to end.
+    pub start_clock_s: f64,
+    /// How long powering on and releasing the brakes take, each, s.
+    pub power_time_s: f64,
+    /// Serial number for the dashboard.
+    pub serial: String,
+    /// Where `load NAME.urp` finds `NAME.script`.
+    pub programs: Option<std::path::PathBuf>,
+}
+
+impl Setup {
+    /// The model as delivered, powered and standing in a bent-elbow pose.
+    pub fn new(model: Model) -> Self {
+        Setup {
+            model,
+            kinematics: model.nominal(),
+            start_joints: [0.0, -1.57, 1.57, -1.57, -1.57, 0.0],
+            rate_hz: model.rate_hz(),
+            start_mode: RobotMode::Running,
+            start_clock_s: 60.0,
+            power_time_s: 1.0,
+            serial: "20245500001".to_owned(),
+            programs: None,
+        }
+    }
+}
+
+/// Mass and tool at the flange.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Payload {
+    /// kg.
+    pub mass: f64,
+    /// Centre of gravity in the flange frame, m.
+    pub cog: [f64; 3],
+    /// Inertia, kg m^2.
+    pub inertia: [f64; 6],
+}
+
+/// The robot and its controller.
+pub struct Robot {
+    /// What it started as.
+    pub setup: Setup,
+    /// Control step, s.
+    pub dt: f64,
+    /// Controller time, s.
+    pub clock_s: f64,
+    /// Control steps since the start.
+    pub steps: u64,
+    /// Robot mode.
+    pub mode: RobotMode,
+    /// Safety mode.
+    pub safety: SafetyMode,
+    /// Program state.
+    pub runtime: RuntimeState,
+    /// Written by RTDE clients.
+    pub inputs: Registers,
+    /// Written by scripts.
+    pub outputs: Registers,
+    /// Digital and analog signals.
+    pub signals: Signals,
+    /// `external_force_torque` input.
+    pub external_wrench: [f64; 6],
+    /// Speed slider, 0 to 1.
+    pub slider: f64,
+    /// At the flange.
+    pub payload: Payload,
+    /// Tool centre point in the flange frame.
+    pub tcp: [f64; 6],
+    /// Whether remote control is on.
+    pub remote_control: bool,
+    /// Messages for the primary interface.
+    pub outbox: Outbox,
+    /// Open popup.
+    pub popup: Option<Popup>,
+    /// What is true of this step.
+    pub truth: Report,
+    /// What RTDE, primary and real-time interfaces tell of it.
+    pub report: Report,
+    /// Distortions of the report.
+    pub report_fault: ReportFault,
+    /// Whether `rtde_set_watchdog` is accepted but never acts (fault R15).
+    pub deaf_watchdog: bool,
+    /// Whether writes of scripts to output registers are lost (fault R15).
+    pub mute_outputs: bool,
+    /// Robot type answered on the primary interface in place of the true one (fault B17).
+    pub claimed_robot_type: Option<i32>,
+    pub(super) generator: Generator,
+    pub(super) drives: Drives,
+    pub(super) programs: Programs,
+    pub(super) watchdogs: Watchdogs,
+    pub(super) motion_left_s: Option<f64>,
+    pub(super) motion_failure: Option<String>,
+    pub(super) sockets: super::host::Sockets,
+    safety_since_s: f64,
+    transition: Option<(f64, RobotMode)>,
+    clock_offset_s: f64,
+}
+
+impl Robot {
+    /// A robot as `setup` says.
+    pub fn new(setup: Setup) -> Self {
+        let dt = 1.0 / setup.rate_hz;
+        let q = setup.start_joints;
+        let mut robot = Robot {
+            dt,
+            clock_s: setup.start_clock_s,
+            steps: 0,
+            mode: setup.start_mode,
+            safety: SafetyMode::Normal,
+            runtime: RuntimeState::Stopped,
+            inputs: Registers::default(),
+            outputs: Registers::default(),
+            signals: Signals::default(),
+            external_wrench: [0.0; 6],
+            slider: 1.0,
+            payload: Payload { mass: 0.0, cog: [0.0; 3], inertia: [0.0; 6] },
+            tcp: [0.0; 6],
+            remote_control: true,
+            outbox: Outbox::default(),
+            popup: None,
+            truth: Report::default(),
+            report: Report::default(),
+            report_fault: ReportFault::default(),
+            deaf_watchdog: false,
+            mute_outputs: false,
+            claimed_robot_type: None,
+            generator: Generator::new(q, setup.kinematics, setup.model.max_speed, setup.model.position_limit()),
+            drives: Drives::new(q, DRIVE_ACCEL),
+            programs: Programs::default(),
+            watchdogs: Watchdogs::default(),
+            motion_left_s: None,
+            motion_failure: None,
+            sockets: super::host::Sockets::default(),
+            safety_since_s: f64::NEG_INFINITY,
+            transition: None,
+            clock_offset_s: 0.0,
+            setup,
+        };
+        robot.drives.set_brakes(robot.mode != RobotMode::Running);
+        robot.truth = Report::of(&robot);
+        robot.report = robot.truth.clone();
+        robot
+    }
+
+    /// One control step: program, motion, joints, supervision. Returns with `report` renewed.
+    pub fn step(&mut self) {
+        self.steps += 1;
+        self.clock_s = self.setup.start_clock_s + self.clock_offset_s + self.steps as f64 * self.dt;
+        self.advance_mode();
+        self.check_watchdogs();
+        self.run_programs();
+        self.move_arm();
+        self.settle_runtime();
+        self.truth = Report::of(self);
+        self.report = self.truth.distorted(&self.report_fault);
+    }
+
+    /// `flange_from_tcp` as a transformation.
+    pub fn flange_from_tcp(&self) -> Isometry3<f64> {
+        crate::plant::vector_to_pose(&self.tcp)
+    }
+
+    /// Controller time in microseconds.
+    pub fn time_us(&self) -> u64 {
+        (self.clock_s.max(0.0) * 1e6) as u64
+    }
+
+    /// Lets the controller's clock start again from zero, or jump by `by_s` seconds (fault R12).
+    pub fn shift_clock(&mut self, by_s: Option<f64>) {
+        self.clock_offset_s = match by_s {
+            Some(by) => self.clock_offset_s + by,
+            None => -self.setup.start_clock_s - self.steps as f64 * self.dt,
+        };
+    }
+
+    /// Adds a message for the primary interface.
+    pub fn say(&mut self, kind: MessageKind) {
+        self.outbox.push(self.time_us(), kind);
+    }
+
+    fn move_arm(&mut self) {
+        let may_move = self.mode == RobotMode::Running;
+        if !may_move {
+            self.generator.snap(self.drives.true_q());
+        } else {
+            let paused = matches!(self.runtime, RuntimeState::Pausing | RuntimeState::Paused);
+            let scaling = if paused { 0.0 } else { self.slider };
+            self.generator.set_tool(crate::plant::vector_to_pose(&self.tcp));
+            if let Err(cause) = self.generator.step(self.dt, scaling) {
+                self.stop_for(cause);
+            }
+        }
+        if let Some(left) = &mut self.motion_left_s {
+            *left -= self.dt;
+        }
+        self.drives.step(self.generator.q(), self.generator.qd(), self.dt);
+        if may_move && self.safety.allows_motion() {
+            let q = self.drives.true_q();
+            let worst = (0..6)
+                .map(|i| (i, (q[i] - self.generator.q()[i]).abs()))
+                .fold((0, 0.0), |m, d| if d.1 > m.1 { d } else { m });
+            if worst.1 > PATH_TOLERANCE {
+                self.stop_for(StopCause::PathDeviation { joint: worst.0, deviation: worst.1 });
+            }
+        }
+    }
+
+    fn stop_for(&mut self, cause: StopCause) {
+        if cause == StopCause::Unreachable {
+            // The script's own mistake: its call fails, and the program with it.
+            self.motion_failure = Some(cause.to_string());
+            return;
+        }
+        let (code, argument) = match cause {
+            StopCause::JointSpeed { joint, .. } => (171, joint as i32),
+            StopCause::JointPosition { joint, .. } => (157, joint as i32),
+            StopCause::PathDeviation { joint, .. } => (153, joint as i32),
+            StopCause::Unreachable => (150, 0),
+        };
+        self.say(MessageKind::Error { code, argument, level: 3, text: cause.to_string() });
+        self.stop_protectively(code, argument);
+    }
+
+    /// Stops the arm as the safety system does; unlocking is refused for five seconds. The program is stopped.
+    pub fn stop_protectively(&mut self, code: i32, argument: i32) {
+        if self.safety.allows_motion() {
+            self.enter_safety(SafetyMode::ProtectiveStop, code, argument);
+            self.end_program();
+            self.generator.safety_stop();
+        }
+    }
+
+    /// Stops the arm with power kept and the program paused, until [`Robot::clear_safety`].
+    pub fn safeguard_stop(&mut self) {
+        if self.safety.allows_motion() {
+            self.enter_safety(SafetyMode::SafeguardStop, 0, 0);
+            if self.runtime == RuntimeState::Playing {
+                self.runtime = RuntimeState::Pausing;
+            }
+        }
+    }
+
+    /// Stops the arm, then takes the power away. `system` tells the emergency input from the pendant's button.
+    pub fn emergency_stop(&mut self, system: bool) {
+        let mode = if system { SafetyMode::SystemEmergencyStop } else { SafetyMode::RobotEmergencyStop };
+        self.enter_safety(mode, 0, 0);
+        self.end_program();
+        self.generator.safety_stop();
+        // Category 1: half a second of controlled stop, then no power.
+        self.transition = Some((self.clock_s + 0.5, RobotMode::PowerOff));
+    }
+
+    /// Brakes at once and takes the power away (category 0): a safety violation, or a fault of the safety system.
+    pub fn safety_failure(&mut self, fault: bool) {
+        self.enter_safety(if fault { SafetyMode::Fault } else { SafetyMode::Violation }, 0, 0);
+        self.end_program();
+        self.set_mode(RobotMode::PowerOff);
+    }
+
+    /// Sets or lifts reduced mode; no effect while stopped.
+    pub fn set_reduced(&mut self, on: bool) {
+        if self.safety.allows_motion() {
+            self.enter_safety(if on { SafetyMode::Reduced } else { SafetyMode::Normal }, 0, 0);
+        }
+        self.generator.set_reduced(on);
+    }
+
+    /// The emergency button is released, the safeguard closed. A protective stop or a fault is not cleared by this.
+    pub fn clear_safety(&mut self) {
+        if self.safety.is_emergency() || matches!(self.safety, SafetyMode::SafeguardStop | SafetyMode::Recovery) {
+            self.enter_safety(SafetyMode::Normal, 0, 0);
+        }
+    }
+
+    /// Unlocks a protective stop; refused in the first five seconds and when there is none.
+    pub fn unlock(&mut self) -> Result<(), &'static str> {
+        if self.safety != SafetyMode::ProtectiveStop {
+            return Ok(());
+        }
+        if self.clock_s - self.safety_since_s < 5.0 {
+            return Err(
+                "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop before unlocking",
+            );
+        }
+        self.enter_safety(SafetyMode::Normal, 0, 0);
+        Ok(())
+    }
+
+    /// Restarts the safety system after a fault or a violation; leaves the arm without power.
+    pub fn restart_safety(&mut self) {
+        self.end_program();
+        self.set_mode(RobotMode::PowerOff);
+        if !self.safety.is_emergency() {
+            self.enter_safety(SafetyMode::Normal, 0, 0);
+        }
+    }
+
+    fn enter_safety(&mut self, mode: SafetyMode, code: i32, argument: i32) {
+        if self.safety != mode {
+            self.safety = mode;
+            self.safety_since_s = self.clock_s;
+            self.say(MessageKind::Safety { code, argument, mode: mode as u8 });
+        }
+    }
+
+    /// Starts to power on; the arm ends with brakes on.
+    pub fn power_on(&mut self) -> bool {
+        if self.mode == RobotMode::PowerOff && !self.safety.is_emergency() && !self.safety_failed() {
+            self.set_mode(RobotMode::PowerOn);
+            self.transition = Some((self.clock_s + self.setup.power_time_s, RobotMode::Idle));
+        }
+        self.mode.is_powered()
+    }
+
+    /// Takes the power away.
+    pub fn power_off(&mut self) {
+        self.end_program();
+        self.set_mode(RobotMode::PowerOff);
+    }
+
+    /// Releases the brakes, powering on first where needed.
+    pub fn brake_release(&mut self) -> bool {
+        if self.safety.is_emergency() || self.safety_failed() {
+            return false;
+        }
+        if self.mode == RobotMode::PowerOff {
+            self.set_mode(RobotMode::PowerOn);
+        }
+        if matches!(self.mode, RobotMode::PowerOn | RobotMode::Idle) {
+            self.transition = Some((self.clock_s + self.setup.power_time_s, RobotMode::Running));
+        }
+        true
+    }
+
+    /// Sets the robot mode at once, as a fault does. Anything but running ends the program and sets the brakes.
+    pub fn set_mode(&mut self, mode: RobotMode) {
+        self.transition = None;
+        self.mode = mode;
+        self.drives.set_brakes(mode != RobotMode::Running);
+        if mode != RobotMode::Running {
+            self.end_program();
+        }
+    }
+
+    fn safety_failed(&self) -> bool {
+        matches!(self.safety, SafetyMode::Violation | SafetyMode::Fault)
+    }
+
+    fn advance_mode(&mut self) {
+        if let Some((at, mode)) = self.transition
+            && self.clock_s >= at
+        {
+            self.set_mode(mode);
+        }
+    }
+
+    /// Puts the arm at `q`, at rest (faults B07 and B11, and the start of a test).
+    pub fn teleport(&mut self, q: Joints) {
+        let fault = *self.drives.fault();
+        self.drives = Drives::new(q, DRIVE_ACCEL);
+        self.drives.set_fault(fault);
+        self.drives.set_brakes(self.mode != RobotMode::Running);
+        self.generator.snap(q);
+    }
+
+    /// Puts a disturbance on the joints.
+    pub fn set_drive_fault(&mut self, change: impl FnOnce(&mut crate::plant::DriveFault)) {
+        let mut fault = *self.drives.fault();
+        change(&mut fault);
+        self.drives.set_fault(fault);
+    }
+
+    /// Whether targets and joints stand still.
+    pub fn at_rest(&self) -> bool {
+        self.generator.at_rest() && self.drives.read_qd().iter().all(|v| v.abs() < 1e-3)
+    }
+}

@@ -1,0 +1,350 @@
+//! The sockets: one thread that polls them all and keeps the control step's grid.
+//!
+//! One thread, so that nothing has to be locked and a thousand reconnects start no thread. Between two steps it sleeps in
+//! `poll`, with the step's absolute deadline as the limit.
+
+use super::command::{Command, Port, WireAction};
+use super::connection::{Connection, READ, Role, lines};
+use super::rtde_session::RtdeSession;
+use super::script_stream::{Script, ScriptStream};
+use super::world::World;
+use super::{dashboard, primary};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use serde_json::json;
+use std::net::{IpAddr, SocketAddr, TcpListener};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Connections at a time; more are closed at once.
+const MOST_CONNECTIONS: usize = 128;
+/// Steps made up after the host stalled; beyond that the grid moves.
+const MOST_CATCH_UP: u32 = 50;
+/// Longest line of a text port, bytes; a script may come through the control port.
+const LONGEST_LINE: usize = 1 << 20;
+
+/// Nanoseconds of CLOCK_MONOTONIC.
+pub fn now_ns() -> u64 {
+    let t = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    (t.tv_sec as u64).saturating_mul(1_000_000_000).saturating_add(t.tv_nsec as u64)
+}
+
+struct Listener {
+    port: Port,
+    read_only: bool,
+    socket: TcpListener,
+}
+
+/// The servers of one controller.
+pub struct Server {
+    /// What is behind them.
+    pub world: World,
+    listeners: Vec<Listener>,
+    connections: Vec<Connection>,
+    next_id: u64,
+    period_ns: u64,
+    /// Steps that began more than a step late.
+    pub late_steps: u64,
+}
+
+/// A port that cannot be opened.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "cannot listen on {address}: {error}; is another controller running there? Try --port-offset or another --bind address"
+)]
+pub struct ListenError {
+    address: SocketAddr,
+    error: std::io::Error,
+}
+
+/// Ports of a controller, with the read-only twins.
+const PORTS: [(u16, Port, bool); 8] = [
+    (29999, Port::Dashboard, false),
+    (30001, Port::Primary, false),
+    (30002, Port::Secondary, false),
+    (30003, Port::Realtime, false),
+    (30004, Port::Rtde, false),
+    (30011, Port::Primary, true),
+    (30012, Port::Secondary, true),
+    (30013, Port::Realtime, true),
+];
+
+impl Server {
+    /// Opens all ports at `address`, each moved by `offset`, and the control port where one is given (0 picks a free one).
+    pub fn bind(world: World, address: IpAddr, offset: u16, control: Option<u16>) -> Result<Self, ListenError> {
+        let mut listeners = Vec::new();
+        let wanted = PORTS.iter().map(|(number, port, ro)| (number.saturating_add(offset), *port, *ro));
+        for (number, port, read_only) in wanted.chain(control.map(|c| (c, Port::Control, false))) {
+            let address = SocketAddr::new(address, number);
+            let socket = TcpListener::bind(address)
+                .and_then(|s| s.set_nonblocking(true).map(|()| s))
+                .map_err(|error| ListenError { address, error })?;
+            listeners.push(Listener { port, read_only, socket });
+        }
+        let period_ns = (1e9 * world.robot.dt) as u64;
+        Ok(Server { world, listeners, connections: Vec::new(), next_id: 1, period_ns, late_steps: 0 })
+    }
+
+    /// The number of the control port, when there is one.
+    pub fn control_port(&self) -> Option<u16> {
+        let control = self.listeners.iter().find(|l| l.port == Port::Control)?;
+        control.socket.local_addr().ok().map(|a| a.port())
+    }
+
+    /// Serves until `stop` is set.
+    pub fn run(&mut self, stop: &Arc<AtomicBool>) {
+        let mut deadline = now_ns() + self.period_ns;
+        let mut buffer = vec![0; READ];
+        while !stop.load(Ordering::Relaxed) {
+            let now = now_ns();
+            if now >= deadline {
+                deadline = self.steps_due(now, deadline);
+            }
+            let due = self.connections.iter().filter_map(Connection::next_due).min();
+            let wake = due.map_or(deadline, |d| d.min(deadline));
+            self.wait(wake.saturating_sub(now_ns()), &mut buffer);
+        }
+        self.world.note(now_ns(), "stopped");
+    }
+
+    /// Runs the steps that are due and returns the next deadline. After a stall the robot makes up its steps, and clients get
+    /// the newest package only.
+    fn steps_due(&mut self, now: u64, mut deadline: u64) -> u64 {
+        if now - deadline > self.period_ns {
+            self.late_steps += 1;
+        }
+        let mut made_up = 0;
+        while deadline <= now {
+            self.world.step(now);
+            deadline += self.period_ns;
+            made_up += 1;
+            if made_up == MOST_CATCH_UP && deadline <= now {
+                deadline = now + self.period_ns;
+            }
+        }
+        self.send_step(now);
+        deadline
+    }
+
+    /// What one step sends to everybody.
+    fn send_step(&mut self, now: u64) {
+        let every = (self.world.robot.setup.rate_hz / 10.0).max(1.0) as u64;
+        let steps = self.world.robot.steps;
+        let messages: Vec<u8> = {
+            let waiting: Vec<_> = self.world.robot.outbox.drain().collect();
+            waiting.iter().flat_map(primary::message_package).collect()
+        };
+        let mut state = None;
+        let mut realtime = None;
+        let mut sample = Vec::new();
+        for c in &mut self.connections {
+            let random = self.world.random();
+            let wire = self.world.wire(c.port);
+            match &mut c.role {
+                Role::State { .. } => {
+                    if !messages.is_empty() && c.port == Port::Primary {
+                        c.send(&messages, &wire, now, random);
+                    }
+                    if steps % every == 0 {
+                        let full = steps % (10 * every) == 0;
+                        let bytes = state.get_or_insert_with(|| primary::robot_state(&self.world.robot, full));
+                        c.send_newest(bytes, &wire, now, random);
+                    }
+                }
+                Role::Realtime { .. } => {
+                    let bytes = realtime.get_or_insert_with(|| primary::realtime(&self.world.robot));
+                    c.send_newest(bytes, &wire, now, random);
+                }
+                Role::Rtde(session) => {
+                    sample.clear();
+                    if session.sample(&self.world.robot, &mut sample) {
+                        c.counted = c.counted.wrapping_add(1);
+                        let keep = self.world.rtde_faults.keep_one_of.max(1);
+                        if c.counted % keep == 0 {
+                            c.send_newest(&sample, &wire, now, random);
+                        }
+                    }
+                }
+                Role::Dashboard(_) | Role::Control(_) => {}
+            }
+            c.flush(&wire, now);
+        }
+        self.bury(now);
+    }
+
+    /// Sleeps until something happens, at most `for_ns`, and deals with it.
+    fn wait(&mut self, for_ns: u64, buffer: &mut [u8]) {
+        let now = now_ns();
+        let mut polls = Vec::with_capacity(self.listeners.len() + self.connections.len());
+        for l in &self.listeners {
+            polls.push(PollFd::new(&l.socket, PollFlags::IN));
+        }
+        for c in &self.connections {
+            let unread = now < self.world.wire(c.port).unread_until;
+            let mut flags = if unread { PollFlags::empty() } else { PollFlags::IN };
+            if c.wants_to_write() {
+                flags |= PollFlags::OUT;
+            }
+            polls.push(PollFd::new(&c.stream, flags));
+        }
+        let timeout = Timespec { tv_sec: (for_ns / 1_000_000_000) as i64, tv_nsec: (for_ns % 1_000_000_000) as i64 };
+        // A signal ends the wait early; the caller looks at its flag.
+        if poll(&mut polls, Some(&timeout)).unwrap_or(0) == 0 && self.connections.iter().all(|c| c.next_due().is_none())
+        {
+            return;
+        }
+        let ready: Vec<PollFlags> = polls.iter().map(PollFd::revents).collect();
+        drop(polls);
+        let now = now_ns();
+        let listeners = self.listeners.len();
+        let ends = PollFlags::IN | PollFlags::HUP | PollFlags::ERR;
+        for i in 0..self.connections.len() {
+            let events = ready.get(listeners + i).copied().unwrap_or(PollFlags::empty());
+            let Some(c) = self.connections.get_mut(i) else { continue };
+            if events.intersects(ends) && now >= self.world.wire(c.port).unread_until {
+                receive(c, &mut self.world, buffer, now);
+            }
+            let wire = self.world.wire(c.port);
+            c.flush(&wire, now);
+        }
+        for i in 0..listeners {
+            if ready.get(i).is_some_and(|e| e.contains(PollFlags::IN)) {
+                self.accept(i, now);
+            }
+        }
+        self.act(now);
+        self.bury(now);
+    }
+
+    fn accept(&mut self, listener: usize, now: u64) {
+        let Some(l) = self.listeners.get(listener) else { return };
+        // A handful at a time: the control step comes first.
+        for _ in 0..16 {
+            let Ok((stream, peer)) = l.socket.accept() else { break };
+            let (port, read_only) = (l.port, l.read_only);
+            if self.world.wire(port).refuse || self.connections.len() >= MOST_CONNECTIONS {
+                continue; // dropped, and thereby closed
+            }
+            let id = self.next_id;
+            self.next_id += 1;
+            let scripts = || (!read_only).then(ScriptStream::default);
+            let role = match port {
+                Port::Dashboard => Role::Dashboard(Vec::new()),
+                Port::Primary | Port::Secondary => Role::State { scripts: scripts() },
+                Port::Realtime => Role::Realtime { scripts: scripts() },
+                Port::Rtde => Role::Rtde(Box::new(RtdeSession::new(id))),
+                Port::Control => Role::Control(Vec::new()),
+            };
+            let Ok(mut c) = Connection::new(id, port, role, stream) else { continue };
+            let random = self.world.random();
+            let wire = self.world.wire(port);
+            match port {
+                Port::Dashboard => c.send(format!("{}\n", dashboard::GREETING).as_bytes(), &wire, now, random),
+                Port::Primary | Port::Secondary => {
+                    c.send(&primary::version_message(&self.world.robot), &wire, now, random);
+                    c.send(&primary::robot_state(&self.world.robot, true), &wire, now, random);
+                }
+                Port::Rtde => self.world.judge.forget_client(),
+                Port::Realtime | Port::Control => {}
+            }
+            self.world.note(now, &format!("connection {id} {port:?} from {peer}"));
+            self.connections.push(c);
+        }
+    }
+
+    /// What the control port asked to be done with connections.
+    fn act(&mut self, now: u64) {
+        for action in std::mem::take(&mut self.world.actions) {
+            for c in &mut self.connections {
+                match &action {
+                    WireAction::Reset(port) if *port == c.port => c.reset(),
+                    WireAction::Close(port) if *port == c.port => c.over = Some("closed on command"),
+                    WireAction::Inject(port, bytes) if *port == c.port => {
+                        let wire = self.world.wire(c.port);
+                        c.send(bytes, &wire, now, 0.0);
+                    }
+                    _ => {}
+                }
+            }
+        }
+    }
+
+    /// Takes away connections that are over, with what they held.
+    fn bury(&mut self, now: u64) {
+        let mut i = 0;
+        while let Some(c) = self.connections.get(i) {
+            let Some(reason) = c.over else {
+                i += 1;
+                continue;
+            };
+            self.world.owners.release(c.id);
+            let text = format!("connection {} {:?} over: {reason}; {} packages left out", c.id, c.port, c.skipped);
+            self.world.note(now, &text);
+            self.connections.swap_remove(i);
+        }
+    }
+}
+
+/// Reads what came on a connection and deals with it.
+fn receive(c: &mut Connection, world: &mut World, buffer: &mut [u8], now: u64) {
+    let Some(bytes) = c.read(buffer).map(<[u8]>::to_vec) else { return };
+    let wire = world.wire(c.port);
+    if now < wire.deaf_until {
+        return;
+    }
+    let mut answer = Vec::new();
+    match &mut c.role {
+        Role::Dashboard(rest) => match lines(rest, &bytes, 4096) {
+            Ok(found) => {
+                for line in found {
+                    let reply = dashboard::answer(&mut world.robot, &line);
+                    world.note(now, &format!("dashboard {line}: {}", reply.line));
+                    answer.extend_from_slice(reply.line.as_bytes());
+                    answer.push(b'\n');
+                    c.finishing |= reply.close;
+                }
+            }
+            Err(()) => c.over = Some("sent a line without an end"),
+        },
+        Role::Control(rest) => match lines(rest, &bytes, LONGEST_LINE) {
+            Ok(found) => {
+                for line in found {
+                    let result = serde_json::from_str::<Command>(&line)
+                        .map_err(|e| format!("{e}; commands look like {{\"cmd\": \"state\"}}"))
+                        .and_then(|command| world.command(command, now));
+                    let reply = match result {
+                        Ok(value) => json!({"ok": true, "result": value, "at_ns": now}),
+                        Err(e) => json!({"ok": false, "error": e}),
+                    };
+                    answer.extend_from_slice(reply.to_string().as_bytes());
+                    answer.push(b'\n');
+                }
+            }
+            Err(()) => c.over = Some("sent a line without an end"),
+        },
+        Role::State { scripts: Some(stream) } | Role::Realtime { scripts: Some(stream) } => {
+            let mut programs = Vec::new();
+            stream.receive(&bytes, |p| programs.push(p));
+            for program in programs {
+                match program {
+                    Script::Program(text) => world.upload(now, &text),
+                    Script::TooLong => world.note(now, "script dropped: too long"),
+                }
+            }
+        }
+        // The read-only ports hear nothing.
+        Role::State { scripts: None } | Role::Realtime { scripts: None } => {}
+        Role::Rtde(session) => {
+            let World { robot, owners, rtde_faults, judge, recorder, .. } = world;
+            let result = session.receive(&bytes, robot, owners, rtde_faults, &mut answer, &mut |package| {
+                World::note_input(judge, recorder, now, &package);
+            });
+            if result.is_err() {
+                c.over = Some("sent a package of impossible size");
+            }
+        }
+    }
+    if !answer.is_empty() {
+        let random = world.random();
+        c.send(&answer, &wire, now, random);
+    }
+}
