@@ -7,6 +7,7 @@
 
 mod body;
 mod layers;
+mod program;
 mod raster;
 mod sensor;
 mod solid;
@@ -15,6 +16,7 @@ mod view;
 mod wheel;
 
 pub use body::Body;
+pub use program::{Args, Fault, main_with_args};
 pub use sensor::{Noise, Sensor};
 pub use solid::{Face, Solid};
 pub use stage::{Stage, Thing};

@@ -1,0 +1,187 @@
+//! The arm's true joints over time, learnt as a second, read-only RTDE client.
+
+use graspd_rt::arm::Joints;
+use graspd_rt::rtde::{Event, Framer, Session, Slot};
+use std::collections::VecDeque;
+use std::io::{Read, Write};
+use std::net::{TcpStream, ToSocketAddrs};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+/// Samples kept: half a second at 500 Hz.
+const KEEP: usize = 256;
+
+/// One look at the arm.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Sample {
+    /// When it was received, CLOCK_MONOTONIC nanoseconds.
+    pub(super) at_ns: u64,
+    /// Measured joints, rad.
+    pub(super) q: Joints,
+    /// Digital outputs.
+    pub(super) outputs: u64,
+}
+
+/// The last half second of the arm.
+#[derive(Debug, Default)]
+struct History {
+    samples: VecDeque<Sample>,
+    connected: bool,
+    received: u64,
+}
+
+/// Shared view of the arm's recent past.
+#[derive(Clone, Debug)]
+pub(super) struct Arm {
+    history: Arc<Mutex<History>>,
+}
+
+pub(super) fn now_ns() -> u64 {
+    let t = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    t.tv_sec.unsigned_abs() * 1_000_000_000 + t.tv_nsec.unsigned_abs()
+}
+
+impl Arm {
+    /// An arm that stands still.
+    pub(super) fn fixed(q: Joints) -> Self {
+        let arm = Self { history: Arc::default() };
+        arm.push(Sample { at_ns: 1, q, outputs: 0 });
+        arm.lock().received = 0;
+        arm
+    }
+
+    fn lock(&self) -> MutexGuard<'_, History> {
+        self.history.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn push(&self, s: Sample) {
+        let mut h = self.lock();
+        if h.samples.len() == KEEP {
+            h.samples.pop_front();
+        }
+        h.samples.push_back(s);
+        h.received += 1;
+    }
+
+    /// Whether the controller is connected, and how many packages came from it.
+    pub(super) fn link(&self) -> (bool, u64) {
+        let h = self.lock();
+        (h.connected, h.received)
+    }
+
+    /// The newest look at the arm.
+    pub(super) fn newest(&self) -> Option<Sample> {
+        self.lock().samples.back().copied()
+    }
+
+    /// Joints at an instant: between two looks in proportion, before the first or after the last one that one's.
+    pub(super) fn at(&self, t_ns: u64) -> Option<Sample> {
+        let h = self.lock();
+        let after = h.samples.partition_point(|s| s.at_ns <= t_ns);
+        let (a, b) = (h.samples.get(after.checked_sub(1).unwrap_or(0))?, h.samples.get(after));
+        let Some(b) = b.filter(|b| b.at_ns > a.at_ns && a.at_ns <= t_ns) else { return Some(*a) };
+        // A gap in the stream is a hold, not a slow glide.
+        if b.at_ns - a.at_ns > 50_000_000 {
+            return Some(*a);
+        }
+        let k = (t_ns - a.at_ns) as f64 / (b.at_ns - a.at_ns) as f64;
+        let q = std::array::from_fn(|i| a.q[i] + k * (b.q[i] - a.q[i]));
+        Some(Sample { at_ns: t_ns, q, outputs: a.outputs })
+    }
+
+    /// Follows a controller until `stop`, reconnecting for ever; the pictures hold the last joints meanwhile.
+    pub(super) fn follow(&self, address: String, stop: Arc<AtomicBool>) {
+        let arm = self.clone();
+        std::thread::spawn(move || {
+            let mut last = String::new();
+            while !stop.load(Ordering::Relaxed) {
+                if let Err(e) = arm.session(&address, &stop) {
+                    if e != last {
+                        eprintln!("graspd-scene: no joints from {address}: {e}; trying again");
+                        last = e;
+                    }
+                } else {
+                    last.clear();
+                }
+                arm.lock().connected = false;
+                std::thread::sleep(Duration::from_millis(200));
+            }
+        });
+    }
+
+    /// One connection, from the handshake to its end.
+    fn session(&self, address: &str, stop: &AtomicBool) -> Result<(), String> {
+        let text = |e: std::io::Error| e.to_string();
+        let target = address.to_socket_addrs().map_err(text)?.next().ok_or("the address names no host")?;
+        let mut stream = TcpStream::connect_timeout(&target, Duration::from_secs(2)).map_err(text)?;
+        stream.set_nodelay(true).map_err(text)?;
+        stream.set_read_timeout(Some(Duration::from_millis(500))).map_err(text)?;
+        stream.set_write_timeout(Some(Duration::from_millis(500))).map_err(text)?;
+        let outputs = ["actual_q", "actual_digital_output_bits"];
+        let mut session = Session::new(&outputs, &[], None).map_err(|e| e.to_string())?;
+        let (Some(joints), Some(bits)) =
+            (session.outputs().slot::<Joints>(outputs[0]), session.outputs().slot::<u64>(outputs[1]))
+        else {
+            return Err("the protocol's tables lack actual_q".into());
+        };
+        let mut framer = Framer::new(vec![0u8; 1 << 16]);
+        let mut out = [0u8; 4096];
+        let mut silent = 0;
+        while !stop.load(Ordering::Relaxed) {
+            while let Some(n) = session.transmit(&mut out).map_err(|e| e.to_string())? {
+                stream.write_all(out.get(..n).unwrap_or_default()).map_err(text)?;
+            }
+            match stream.read(framer.space()) {
+                Ok(0) => return Err("the controller closed the connection".into()),
+                Ok(n) => {
+                    framer.commit(n);
+                    silent = 0;
+                }
+                Err(e) if matches!(e.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut) => {
+                    silent += 1;
+                    if silent > 4 {
+                        return Err("the controller is silent".into());
+                    }
+                }
+                Err(e) => return Err(e.to_string()),
+            }
+            let at_ns = now_ns();
+            while let Some(package) = framer.next().map_err(|e| e.to_string())? {
+                if let Event::Data(values) = session.handle(package).map_err(|e| e.to_string())? {
+                    self.take(joints, bits, values, at_ns);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn take(&self, joints: Slot<Joints>, bits: Slot<u64>, values: &[u8], at_ns: u64) {
+        let (Some(q), Some(outputs)) = (joints.read(values), bits.read(values)) else { return };
+        if q.iter().all(|v| v.is_finite()) {
+            self.push(Sample { at_ns, q, outputs });
+            self.lock().connected = true;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn joints_between_two_looks_are_in_proportion_and_outside_they_hold() {
+        let arm = Arm { history: Arc::default() };
+        assert_eq!(arm.at(5), None);
+        for k in 0..400u64 {
+            arm.push(Sample { at_ns: 1_000 + 2_000_000 * k, q: [k as f64; 6], outputs: k });
+        }
+        let h = |k: u64| 1_000 + 2_000_000 * k;
+        assert_eq!(arm.at(h(300)).unwrap().q, [300.0; 6]);
+        assert!((arm.at(h(300) + 500_000).unwrap().q[2] - 300.25).abs() < 1e-9);
+        assert_eq!(arm.at(h(399) + 9_000_000).unwrap().q, [399.0; 6]);
+        assert_eq!(arm.at(0).unwrap().q, [144.0; 6], "older than what is kept: the oldest");
+        arm.push(Sample { at_ns: h(399) + 80_000_000, q: [0.0; 6], outputs: 0 });
+        assert_eq!(arm.at(h(399) + 40_000_000).unwrap().q, [399.0; 6], "a gap is a hold");
+    }
+}

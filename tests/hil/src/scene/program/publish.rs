@@ -1,0 +1,399 @@
+//! The publishing loop: a camera's beat, the arm at the instant of exposure, the pictures, the stamps.
+
+use super::faults::{Fault, Timed, disc};
+use super::joints::{Arm, now_ns};
+use crate::scenario::Scenario;
+use crate::scene::{Snapshot, StereoRenderer};
+use graspd_calib::files::RigFile;
+use graspd_rt::geom::{Pixel, Pose, View};
+use graspd_shm::frame::{ClockSource, FrameGeometry, FramePublisher, FrameStamp, PixelFormat, flags, id_hash};
+use graspd_shm::{ShmError, ShmNode};
+use nalgebra::{Point3, UnitQuaternion, Vector3};
+use rustix::time::{ClockId, Timespec};
+use serde_json::{Value, json};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, channel};
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Serial numbers of the simulated cameras.
+pub(super) const SERIALS: [&str; 2] = ["sim-left", "sim-right"];
+/// Exposure time that is stated, ns. Pictures are of one instant: at the speeds of a servo the blur would be a fraction of a pixel.
+const EXPOSURE_NS: u64 = 2_000_000;
+/// How long to wait for a look at the arm after the exposure, ns.
+const PATIENCE_NS: u64 = 8_000_000;
+/// How fast the jaws move, m/s.
+const JAW_SPEED: f64 = 0.08;
+
+/// What others may see of and change in the running scene.
+#[derive(Debug, Default)]
+pub(super) struct Shared {
+    inner: Mutex<Inner>,
+}
+
+#[derive(Debug, Default)]
+struct Inner {
+    faults: Vec<Timed>,
+    published: u64,
+    late: u64,
+    render_us: f64,
+    opening: f64,
+    scenario: Option<Box<Scenario>>,
+}
+
+impl Shared {
+    fn with<T>(&self, f: impl FnOnce(&mut Inner) -> T) -> T {
+        f(&mut self.inner.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    pub(super) fn add(&self, fault: Timed) {
+        self.with(|i| i.faults.push(fault));
+    }
+
+    pub(super) fn clear(&self) {
+        self.with(|i| i.faults.clear());
+    }
+
+    pub(super) fn faults(&self) -> Vec<Fault> {
+        self.with(|i| i.faults.iter().map(|t| t.fault.clone()).collect())
+    }
+
+    fn active(&self, t: u64) -> Vec<Fault> {
+        self.with(|i| {
+            i.faults.retain(|f| t < f.until_ns);
+            i.faults.iter().filter(|f| f.active(t)).map(|f| f.fault.clone()).collect()
+        })
+    }
+
+    /// Figures of the loop.
+    pub(super) fn status(&self) -> Value {
+        self.with(|i| {
+            json!({ "published": i.published, "late": i.late, "render_us": i.render_us.round(), "opening_m": i.opening,
+                    "faults": i.faults.len() })
+        })
+    }
+
+    /// The scene as it is now, an object that was moved included.
+    pub(super) fn scenario(&self) -> Option<Scenario> {
+        self.with(|i| i.scenario.as_deref().cloned())
+    }
+
+    pub(super) fn set_scenario(&self, s: Scenario) {
+        self.with(|i| i.scenario = Some(Box::new(s)));
+    }
+}
+
+/// The loop's own state.
+pub(super) struct Loop {
+    scenario: Scenario,
+    renderer: StereoRenderer,
+    arm: Arm,
+    shared: Arc<Shared>,
+    publisher: FramePublisher,
+    rate: f64,
+    latency_ns: u64,
+    close_output: u32,
+    opening: f64,
+    /// What faults hold on to: pictures and stamps of each eye, pose.
+    held: [Option<(Vec<u8>, u64)>; 2],
+    held_pose: Option<[Option<Pose>; 2]>,
+    /// A renderer being made for cameras or an object that moved, and the faults it is made for.
+    moved: Vec<Fault>,
+    pending: Option<Receiver<(Scenario, StereoRenderer)>>,
+    second: Option<(ShmNode, FramePublisher)>,
+}
+
+impl Loop {
+    /// Joins the topic. Must run on the thread that publishes.
+    pub(super) fn new(
+        scenario: Scenario,
+        renderer: StereoRenderer,
+        arm: Arm,
+        shared: Arc<Shared>,
+        node: &ShmNode,
+        (rate, latency_ms, close_output): (f64, f64, u32),
+    ) -> Result<Self, ShmError> {
+        let (w, h) = renderer.size();
+        let mut publisher = FramePublisher::new(node, FrameGeometry::packed(w as u32, h as u32, PixelFormat::Mono8))?;
+        let calibration = RigFile::new(scenario.given_rig).id();
+        publisher.identify(SERIALS.map(id_hash), calibration, ClockSource::Simulated);
+        let opening = scenario.gripper.opening[1];
+        shared.set_scenario(scenario.clone());
+        Ok(Self {
+            scenario,
+            renderer,
+            arm,
+            shared,
+            publisher,
+            rate,
+            latency_ns: (latency_ms.clamp(0.0, 500.0) * 1e6) as u64,
+            close_output,
+            opening,
+            held: [None, None],
+            held_pose: None,
+            moved: Vec::new(),
+            pending: None,
+            second: None,
+        })
+    }
+
+    /// Publishes until `stop`; calls `ready` once, after the first pair is out.
+    pub(super) fn run(mut self, node: &ShmNode, stop: &AtomicBool, ready: impl FnOnce()) -> Result<(), ShmError> {
+        let start = now_ns();
+        let mut capture = start;
+        let mut trigger = 0u64;
+        let mut ready = Some(ready);
+        while !stop.load(Ordering::Relaxed) {
+            trigger += 1;
+            let active = self.shared.active(now_ns());
+            let rate = active.iter().find_map(|f| if let Fault::Rate { hz } = f { Some(*hz) } else { None });
+            let period = (1e9 / rate.unwrap_or(self.rate).clamp(0.5, 2000.0)) as u64;
+            capture += period;
+            let now = now_ns();
+            if capture < now.saturating_sub(self.latency_ns) {
+                // Too late for this beat: leave out whole beats and keep the grid.
+                let lost = (now - self.latency_ns - capture).div_ceil(period);
+                for _ in 0..lost.min(1000) {
+                    self.publisher.skip();
+                }
+                trigger += lost;
+                capture += lost * period;
+                self.shared.with(|i| i.late += lost);
+            }
+            sleep_until(capture + self.latency_ns);
+            self.wait_for_arm(capture);
+            self.pair(node, &active, capture, trigger, (now_ns() - start) as f64 * 1e-9)?;
+            if let Some(ready) = ready.take() {
+                ready();
+            }
+        }
+        Ok(())
+    }
+
+    /// Waits until the arm was looked at after the exposure, so that its joints then lie between two looks.
+    fn wait_for_arm(&self, capture: u64) {
+        if !self.arm.link().0 {
+            return;
+        }
+        let end = capture + self.latency_ns + PATIENCE_NS;
+        while now_ns() < end && self.arm.newest().is_none_or(|s| s.at_ns < capture) {
+            sleep_until(now_ns() + 500_000);
+        }
+    }
+
+    /// Renders and publishes one pair.
+    fn pair(&mut self, node: &ShmNode, active: &[Fault], capture: u64, trigger: u64, t_s: f64) -> Result<(), ShmError> {
+        self.follow_moves(active);
+        let mut stamps = [capture; 2];
+        for f in active {
+            if let Fault::Skew { ms } = f {
+                stamps[1] = capture.saturating_add_signed((-ms * 1e6) as i64);
+            }
+        }
+        let shot = self.snapshot(active, stamps, trigger);
+        if active.iter().any(|f| matches!(f, Fault::Stop { eye: None })) {
+            return Ok(());
+        }
+        if active.iter().any(|f| matches!(f, Fault::Drop { every } if trigger.is_multiple_of((*every).max(1)))) {
+            self.publisher.skip();
+            return Ok(());
+        }
+        let before = now_ns();
+        let (w, h) = self.renderer.size();
+        let mut loan = self.publisher.loan()?;
+        let (left, right) = loan.pictures();
+        let swap = active.iter().any(|f| matches!(f, Fault::Swap { .. }));
+        let targets = if swap { [right, left] } else { [left, right] };
+        for view in View::BOTH {
+            let eye = view.index();
+            let picture = &mut *targets[eye];
+            let freeze = active.iter().any(|f| matches!(f, Fault::Freeze { eye: e } if e.is_none_or(|e| e == eye)));
+            let stopped = active.iter().any(|f| matches!(f, Fault::Stop { eye: Some(e) } if *e == eye));
+            if let Some((old, stamp)) = self.held[eye].as_ref().filter(|_| freeze || stopped) {
+                picture.copy_from_slice(old);
+                if stopped {
+                    stamps[eye] = *stamp;
+                }
+                continue;
+            }
+            self.renderer.draw(view, &shot, picture, w);
+            for f in active {
+                f.spoil(eye, picture, w, h, t_s, trigger * 2 + eye as u64);
+                marks_fault(f, &self.scenario, view, &shot, picture, (w, h));
+            }
+            self.held[eye] = if freeze || stopped { Some((picture.to_vec(), stamps[eye])) } else { None };
+        }
+        let render_us = (now_ns() - before) as f64 * 1e-3;
+        let stamp = FrameStamp {
+            capture_ns: stamps,
+            publish_ns: now_ns(),
+            exposure_ns: EXPOSURE_NS,
+            gain_db: 0.0,
+            trigger,
+            flags: flags::SYNCHRONISED,
+        };
+        loan.send_with(&stamp, |h| active.iter().for_each(|f| f.lie(h, t_s)))?;
+        self.second_publisher(node, active, &stamp)?;
+        let opening = self.opening;
+        self.shared.with(|i| {
+            i.published += 1;
+            i.opening = opening;
+            i.render_us += (render_us - i.render_us) * if i.published < 20 { 0.5 } else { 0.02 };
+        });
+        Ok(())
+    }
+
+    /// Where gripper and jaws are at the eyes' stamps, faults included.
+    fn snapshot(&mut self, active: &[Fault], stamps: [u64; 2], frame: u64) -> Snapshot {
+        let mut pose = stamps.map(|t| self.arm.at(t).map(|s| self.scenario.object_from_gripper(&s.q)));
+        let outputs = self.arm.at(stamps[0]).map_or(0, |s| s.outputs);
+        // Jaws close until they touch the rim when it is between them, else to their stop.
+        let [least, most] = self.scenario.gripper.opening;
+        let close = outputs >> self.close_output.min(63) & 1 == 1;
+        let grasped = pose[0].is_some_and(|p| p.translation.vector.norm() < 0.02);
+        let rim = 2.0 * self.scenario.stage.wheel.outer_radius();
+        let goal = if !close {
+            most
+        } else if grasped {
+            rim.clamp(least, most)
+        } else {
+            least
+        };
+        let step = JAW_SPEED / self.rate;
+        self.opening += (goal - self.opening).clamp(-step, step);
+        let mut hidden_marks = 0;
+        let mut hold = false;
+        for f in active {
+            match f {
+                Fault::OccludeMark { mark } if *mark < 32 => hidden_marks |= 1 << mark,
+                Fault::HideGripper {} => pose = [None, None],
+                Fault::Teleport { mm } => {
+                    pose = pose.map(|p| p.map(|p| p * Pose::translation(mm * 1e-3, 0.0, 0.0)));
+                }
+                Fault::HoldPose {} => hold = true,
+                _ => {}
+            }
+        }
+        if hold {
+            pose = *self.held_pose.get_or_insert(pose);
+        } else {
+            self.held_pose = None;
+        }
+        Snapshot { object_from_gripper: pose, opening: self.opening, frame, hidden_marks }
+    }
+
+    /// Starts, and takes over, new fixed layers when a camera is knocked or the object moved.
+    fn follow_moves(&mut self, active: &[Fault]) {
+        if let Some((scenario, renderer)) = self.pending.as_ref().and_then(|p| p.try_recv().ok()) {
+            (self.scenario, self.renderer) = (scenario, renderer);
+            self.shared.set_scenario(self.scenario.clone());
+            self.pending = None;
+        }
+        let moves: Vec<Fault> = active
+            .iter()
+            .filter(|f| matches!(f, Fault::KnockCamera { .. } | Fault::MoveObject { .. }))
+            .cloned()
+            .collect();
+        if moves == self.moved || self.pending.is_some() {
+            return;
+        }
+        // Undo what was, do what is now.
+        let mut s = self.scenario.clone();
+        for (list, sign) in [(&self.moved, -1.0), (&moves, 1.0)] {
+            let order: Vec<&Fault> = if sign < 0.0 { list.iter().rev().collect() } else { list.iter().collect() };
+            for f in order {
+                displace(&mut s, f, sign);
+            }
+        }
+        self.moved = moves;
+        let (send, receive) = channel();
+        std::thread::spawn(move || {
+            let renderer = s.renderer();
+            let _ = send.send((s, renderer));
+        });
+        self.pending = Some(receive);
+    }
+
+    fn second_publisher(&mut self, node: &ShmNode, active: &[Fault], stamp: &FrameStamp) -> Result<(), ShmError> {
+        if !active.iter().any(|f| matches!(f, Fault::SecondPublisher {})) {
+            self.second = None;
+            return Ok(());
+        }
+        if self.second.is_none() {
+            let own = graspd_shm::create_node(node.names(), "graspd-scene-second")?;
+            let publisher = FramePublisher::new(&own, self.publisher.geometry())?;
+            self.second = Some((own, publisher));
+        }
+        if let Some((_, p)) = &mut self.second {
+            let mut loan = p.loan()?;
+            let (l, r) = loan.pictures();
+            l.fill(0);
+            r.fill(0);
+            loan.send(stamp)?;
+        }
+        Ok(())
+    }
+}
+
+/// Moves a camera or the object, forth (`sign` 1) or back (-1).
+fn displace(s: &mut Scenario, f: &Fault, sign: f64) {
+    match f {
+        Fault::KnockCamera { eye, mm, deg } => {
+            let turn = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), deg.to_radians());
+            let knock = Pose::from_parts(Vector3::new(mm * 1e-3, 0.0, 0.0).into(), turn);
+            // New camera coordinates of a point from the old ones.
+            let knock = if sign > 0.0 { knock } else { knock.inverse() };
+            if *eye == 0 {
+                s.base_from_left *= knock.inverse();
+                s.true_rig.right_from_left *= knock.inverse();
+            } else {
+                s.true_rig.right_from_left = knock * s.true_rig.right_from_left;
+            }
+        }
+        Fault::MoveObject { mm } => s.base_from_object *= Pose::translation(sign * mm * 1e-3, 0.0, 0.0),
+        _ => {}
+    }
+}
+
+/// Faults that need to know where marks are.
+fn marks_fault(f: &Fault, s: &Scenario, view: View, shot: &Snapshot, picture: &mut [u8], (w, h): (usize, usize)) {
+    let at = |mark: usize| -> Option<Pixel> {
+        let m = s.gripper.gripper.marks.get(mark)?;
+        let left = s.left_from_object() * shot.object_from_gripper[view.index()]?;
+        s.true_rig.project(view, &(left * Point3::from(m.position)).coords)
+    };
+    match f {
+        Fault::Blob { mark, du, dv, radius, grey } => {
+            if let Some(p) = at(*mark) {
+                disc(picture, w, h, (p.x + du, p.y + dv), radius.clamp(0.5, 200.0), *grey);
+            }
+        }
+        Fault::SwapMarks { a, b } => {
+            if let (Some(p), Some(q)) = (at(*a), at(*b)) {
+                swap_windows(picture, (w, h), p, q, 10);
+            }
+        }
+        _ => {}
+    }
+}
+
+fn swap_windows(picture: &mut [u8], (w, h): (usize, usize), p: Pixel, q: Pixel, half: i64) {
+    let corner = |c: Pixel| (c.x.round() as i64 - half, c.y.round() as i64 - half);
+    let ((px, py), (qx, qy)) = (corner(p), corner(q));
+    let index = |x: i64, y: i64| {
+        let inside = x >= 0 && y >= 0 && x < w as i64 && y < h as i64;
+        inside.then(|| y as usize * w + x as usize)
+    };
+    for j in 0..=2 * half {
+        for i in 0..=2 * half {
+            if let (Some(a), Some(b)) = (index(px + i, py + j), index(qx + i, qy + j)) {
+                picture.swap(a, b);
+            }
+        }
+    }
+}
+
+/// Sleeps until an instant of CLOCK_MONOTONIC.
+fn sleep_until(t_ns: u64) {
+    let at = Timespec { tv_sec: (t_ns / 1_000_000_000) as i64, tv_nsec: (t_ns % 1_000_000_000) as i64 };
+    let _ = rustix::thread::clock_nanosleep_absolute(ClockId::Monotonic, &at);
+}
