@@ -470,10 +470,15 @@ impl CommandCycle {
     }
 
     /// Whether the filtered correction is within `factor` times the tolerance.
+    ///
+    /// The tolerance is never finer than what the marks' own noise allows (one view resolves depth ten times worse than two),
+    /// up to a stated coarseness; noisier marks never converge, and say so.
     fn within(&self, screw: &Screw, factor: f64) -> bool {
         let c = &self.config.settings.converge;
-        self.filtered.fixed_rows::<3>(0).norm() <= c.position_m * factor
-            && self.filtered.fixed_rows::<3>(3).norm() <= c.angle_rad * factor
+        // The low pass leaves 0.42 of the noise; one and a half of the raw deviation is passed by it nearly always.
+        let open = |tolerance: f64, sigma: f64| (1.5 * sigma).clamp(tolerance, tolerance * c.noise_factor) * factor;
+        self.filtered.fixed_rows::<3>(0).norm() <= open(c.position_m, screw.sigma_m)
+            && self.filtered.fixed_rows::<3>(3).norm() <= open(c.angle_rad, screw.sigma_rad)
             && screw.error_px <= c.error_px * factor.max(1.0)
     }
 

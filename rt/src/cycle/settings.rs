@@ -15,6 +15,8 @@ pub struct ConvergeSettings {
     pub position_m: f64,
     /// Filtered correction left, rad. Default 0.002 (0.11 degrees).
     pub angle_rad: f64,
+    /// How much coarser both may become where the marks' noise allows no better. Default 5.
+    pub noise_factor: f64,
     /// Greatest mark error, pixels rms: a guard against a plan of another rig. Default 12.
     pub error_px: f64,
     /// Pictures in a row on the grasp. Default 12.
@@ -32,6 +34,7 @@ impl Default for ConvergeSettings {
         Self {
             position_m: 0.0003,
             angle_rad: 0.002,
+            noise_factor: 5.0,
             error_px: 12.0,
             frames: 12,
             pregrasp_factor: 4.0,
@@ -120,6 +123,15 @@ impl Default for WatchSettings {
             probe_agreement: 0.4,
             probe_limit_m: 0.012,
         }
+    }
+}
+
+impl WatchSettings {
+    /// For a host without real-time scheduling: missed beats are counted and hold nothing, and robot state and the loop itself
+    /// may be twice as late. The robot-side watchdog of 50 ms stays what it is.
+    pub fn best_effort() -> Self {
+        let d = Self::default();
+        Self { overruns_per_s: 0, stall_ns: 2 * d.stall_ns, state_age_ns: 2 * d.state_age_ns, ..d }
     }
 }
 

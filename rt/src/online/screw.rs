@@ -115,6 +115,10 @@ pub struct Screw {
     pub error_px: f64,
     /// What of `error_px` no motion can remove: noise and calibration error. At rest this is the rig's health figure.
     pub residual_px: f64,
+    /// Standard deviation of the correction's translation that the marks' covariances predict, metres.
+    pub sigma_m: f64,
+    /// The same of its turn, rad.
+    pub sigma_rad: f64,
     /// Smallest singular value of the unit-scaled stack, pixels (rms) per metre.
     pub sigma_min: f64,
     /// Largest over smallest singular value.
@@ -240,7 +244,10 @@ impl Stack {
             return Err(ScrewError::IllConditioned { sigma_min, condition });
         }
         let damped = h + Matrix6::identity() * math::sq(s.damping_px_per_m);
-        let x = damped.cholesky().ok_or(ScrewError::IllConditioned { sigma_min, condition })?.solve(&g);
+        let cholesky = damped.cholesky().ok_or(ScrewError::IllConditioned { sigma_min, condition })?;
+        let x = cholesky.solve(&g);
+        let spread = cholesky.inverse().diagonal() / self.weight;
+        let sum = |from: usize| math::sqrt(spread[from] + spread[from + 1] + spread[from + 2]);
         let mut correction = -x;
         for k in 3..6 {
             correction[k] /= s.length_m;
@@ -256,6 +263,8 @@ impl Stack {
             correction,
             error_px: math::sqrt(self.plain_squares / rows),
             residual_px: math::sqrt(left),
+            sigma_m: sum(0),
+            sigma_rad: sum(3) / s.length_m,
             sigma_min,
             condition,
             points: self.points,

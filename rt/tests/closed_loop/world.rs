@@ -4,8 +4,10 @@ use graspd_rt::arm::{ArmCommand, ArmMode, Dh, Joints, Model, READY, RobotState};
 use graspd_rt::cycle::{
     CommandCycle, CommandInput, CommandOutput, CycleConfig, CycleSettings, LinkStatus, Request, RequestKind,
 };
-use graspd_rt::geom::{Camera, Distortion, Pose, Rig, Twist, Vec3, View, exp_twist, log_pose};
+use graspd_rt::geom::{Camera, Distortion, Pixel, Pose, Rig, Twist, Vec3, View, exp_twist, log_pose};
 use graspd_rt::gripper::{Gripper, MAX_MARKS, Mark};
+use graspd_rt::online::interaction::PlacedView;
+use graspd_rt::online::screw::{LawSettings, MarkError, Stack};
 use graspd_rt::online::{MarkObservation, Vision, VisionStatus};
 use graspd_rt::setpoint::{Goal, SetPoint};
 use nalgebra::{Matrix2, Matrix6};
@@ -59,6 +61,8 @@ pub(crate) struct Faults {
     pub(crate) nan_marks: bool,
     pub(crate) jump_marks: bool,
     pub(crate) stall: bool,
+    /// Beats come up to this share of a period early or late.
+    pub(crate) jitter: f64,
     pub(crate) slider_zero: bool,
 }
 
@@ -87,6 +91,8 @@ pub(crate) struct World {
     pending: ArmCommand,
     pub(crate) sent: Vec<(u64, Joints)>,
     pub(crate) outputs: u32,
+    /// Time that each step of the cycle took, ns.
+    pub(crate) step_ns: Vec<u64>,
 }
 
 fn gripper() -> Gripper {
@@ -162,12 +168,34 @@ impl World {
             pending: ArmCommand::default(),
             sent: Vec::new(),
             outputs: 0,
+            step_ns: Vec::new(),
         }
     }
 
     pub(crate) fn left_from_gripper(&self) -> Pose {
         self.base_from_left.inverse()
             * self.true_dh.base_from_gripper(&self.q, &self.config.gripper.flange_from_gripper)
+    }
+
+    /// Makes the rig that the daemon (and the plan) believes wrong by 0.5 % in focal length and 0.1 degrees in relative rotation,
+    /// while what the cameras see at the goal stays what it is.
+    pub(crate) fn misplace_rig(&mut self) {
+        let goal = self.setpoint.grasp.left_from_gripper;
+        let seen = plan(&self.config, goal).marks;
+        let rig = &mut self.config.rig;
+        for c in [&mut rig.left, &mut rig.right] {
+            let k = 1.0 + if self.rng.next() % 2 == 0 { 5e-3 } else { -5e-3 };
+            c.fx *= k;
+            c.fy *= k;
+        }
+        let axis =
+            Vec3::new(self.rng.even(1.0), self.rng.even(1.0), self.rng.even(1.0)).normalize() * 0.1_f64.to_radians();
+        rig.right_from_left *= exp_twist(&Twist::new(0.0, 0.0, 0.0, axis.x, axis.y, axis.z));
+        let believed = estimate(&self.config, goal, &seen);
+        let pregrasp = believed * Pose::translation(0.0, 0.0, -0.07);
+        self.setpoint.grasp = Goal { left_from_gripper: believed, marks: seen };
+        self.setpoint.pregrasp = plan(&self.config, pregrasp);
+        self.cycle = CommandCycle::new(self.config.clone()).unwrap();
     }
 
     /// True distance (mm) and angle (degrees) to a pose.
@@ -198,6 +226,10 @@ impl World {
             }
         }
         let e = Twist::from_fn(|i, _| self.rng.normal(if i < 3 { 1e-4 } else { 4e-4 }));
+        let pixels = marks.map(|view| view.map(|m: Option<MarkObservation>| m.map(|m| m.pixel)));
+        // With a rig that is believed wrongly, the pose that its pictures suggest is wrong as well.
+        let estimate =
+            if self.true_rig == self.config.rig { pose * exp_twist(&e) } else { estimate(&self.config, pose, &pixels) };
         self.sequence += 1;
         Vision {
             sequence: self.sequence,
@@ -205,7 +237,7 @@ impl World {
             status: VisionStatus::Tracking,
             marks,
             seen,
-            left_from_gripper: pose * exp_twist(&e),
+            left_from_gripper: estimate,
             covariance: Matrix6::identity() * 1e-8,
             residual_px: self.noise_px,
         }
@@ -247,7 +279,8 @@ impl World {
     /// One beat with an optional request.
     pub(crate) fn beat(&mut self, request: Option<RequestKind>, offer: bool) -> CommandOutput {
         let dt = self.period as f64 * 1e-9;
-        self.now += if self.faults.stall { 30 * MS } else { self.period };
+        let late = self.rng.even(self.faults.jitter) * self.period as f64;
+        self.now += if self.faults.stall { 30 * MS } else { (self.period as f64 + late) as u64 };
         // The arm: last beat's set-point, through a first-order lag.
         let mut target = if self.pending.mode == ArmMode::Velocity { self.pending.rates } else { [0.0; 6] };
         let slider = if self.faults.slider_zero { 0.0 } else { self.slider };
@@ -299,6 +332,7 @@ impl World {
         }
         let beat = self.pending.beat;
         let state = self.state(beat);
+        let before = std::time::Instant::now();
         let output = self.cycle.step(&CommandInput {
             now_ns: self.now,
             robot: (!self.faults.no_state && !self.faults.link_down).then_some(state),
@@ -308,6 +342,7 @@ impl World {
             setpoint: offer.then_some(&self.setpoint),
             internal_fault: false,
         });
+        self.step_ns.push(before.elapsed().as_nanos() as u64);
         self.pending = output.command;
         self.outputs = output.command.outputs;
         self.sent.push((self.now, output.command.rates));
@@ -344,6 +379,25 @@ impl World {
             }
         }
     }
+}
+
+/// Pose that fits pixels best in the believed rig, from a start close to it.
+fn estimate(c: &CycleConfig, start: Pose, pixels: &[[Option<Pixel>; MAX_MARKS]; 2]) -> Pose {
+    let mut pose = start;
+    let law = LawSettings { damping_px_per_m: 0.0, ..Default::default() };
+    for _ in 0..8 {
+        let mut stack = Stack::new(&law);
+        for view in View::BOTH {
+            let placed = PlacedView::new(c.rig.camera(view), &(c.rig.view_from_left(view) * pose));
+            for (m, pixel) in c.gripper.marks.iter().zip(&pixels[view.index()]) {
+                let (Some(reference), Some(now)) = (*pixel, placed.project(&m.position)) else { continue };
+                let error = MarkError { now, reference, covariance: Matrix2::identity(), factor: 1.0 };
+                stack.add(&placed, &placed, &m.position, &error);
+            }
+        }
+        pose *= exp_twist(&stack.solve().unwrap().correction);
+    }
+    pose
 }
 
 fn plan(c: &CycleConfig, pose: Pose) -> Goal {
