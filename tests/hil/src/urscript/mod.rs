@@ -10,6 +10,7 @@
 mod arithmetic;
 mod ast;
 mod builtins;
+mod collector;
 mod compile;
 mod error;
 mod expression;
@@ -22,6 +23,7 @@ mod signature;
 mod sockets;
 mod value;
 
+pub use collector::{Collector, Upload};
 pub use error::{HostError, RuntimeError, ScriptError};
 pub use host::{
     Bank, Connect, Host, JOINTS, JointVector, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup, PoseVector,

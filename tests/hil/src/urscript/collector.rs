@@ -1,0 +1,135 @@
+//! Bytes of a script port to uploads: where one program ends and the next begins.
+
+/// Bytes kept of an upload that has not ended.
+const MAX_PENDING: usize = super::lexer::MAX_SOURCE_BYTES;
+
+/// One complete upload.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Upload {
+    /// Text for [`super::Machine::load`].
+    Program(String),
+    /// The bare line `stop program`, a command of the port and no URScript.
+    StopProgram,
+}
+
+/// Splits what a client sends: a `def` or `sec` up to its own `end`, any other line by itself. An unfinished last line waits for
+/// its newline, as on the controller.
+#[derive(Debug, Default)]
+pub struct Collector {
+    bytes: Vec<u8>,
+    program: String,
+    depth: usize,
+}
+
+impl Collector {
+    /// Takes bytes in any portions and returns the uploads that they complete.
+    ///
+    /// # Errors
+    /// More than 1 MiB without an end: the connection should be closed.
+    pub fn push(&mut self, bytes: &[u8]) -> Result<Vec<Upload>, &'static str> {
+        let mut out = Vec::new();
+        for part in bytes.split_inclusive(|b| *b == b'\n') {
+            if self.bytes.len() + self.program.len() + part.len() > MAX_PENDING {
+                return Err("a program of more than 1 MiB");
+            }
+            self.bytes.extend_from_slice(part);
+            if part.ends_with(b"\n") {
+                let line = String::from_utf8_lossy(&std::mem::take(&mut self.bytes)).into_owned();
+                out.extend(self.line(&line));
+            }
+        }
+        Ok(out)
+    }
+
+    fn line(&mut self, line: &str) -> Option<Upload> {
+        let words = words(line);
+        if self.depth == 0 {
+            match words.as_slice() {
+                // Comments ahead of a program keep their place so that line numbers stay those of the client.
+                [] => {
+                    if !line.trim().is_empty() || !self.program.is_empty() {
+                        self.program.push_str(line);
+                    }
+                    return None;
+                }
+                [first, second] if first == "stop" && second == "program" => {
+                    self.program.clear();
+                    return Some(Upload::StopProgram);
+                }
+                _ => {}
+            }
+        }
+        self.program.push_str(line);
+        for word in &words {
+            match word.as_str() {
+                "def" | "sec" | "thread" | "if" | "while" => self.depth += 1,
+                "end" => self.depth = self.depth.saturating_sub(1),
+                _ => {}
+            }
+        }
+        (self.depth == 0).then(|| Upload::Program(std::mem::take(&mut self.program)))
+    }
+}
+
+/// Words outside strings and comments.
+fn words(line: &str) -> Vec<String> {
+    let mut out = Vec::new();
+    let mut word = String::new();
+    let mut quote = None;
+    if line.trim_start().starts_with('$') {
+        return out;
+    }
+    for c in line.chars().chain(['\n']) {
+        match quote {
+            Some(q) if c == q => quote = None,
+            Some(_) => {}
+            None if c.is_ascii_alphanumeric() || c == '_' => word.push(c),
+            None => {
+                if !word.is_empty() {
+                    out.push(std::mem::take(&mut word));
+                }
+                match c {
+                    '#' => break,
+                    '"' | '\'' => quote = Some(c),
+                    _ => {}
+                }
+            }
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TEXT: &str = "# head\ndef a():\n  if True: # end\n    textmsg(\"end\")\n  end\nend\nset_digital_out(1, True)\nstop program\nsec b():\n x = 1\nend\n";
+
+    #[test]
+    fn programs_are_split_at_their_own_end_whatever_the_portions() {
+        let whole = Collector::default().push(TEXT.as_bytes()).unwrap();
+        assert_eq!(whole.len(), 4);
+        assert!(matches!(&whole[0], Upload::Program(p) if p.starts_with("# head\ndef a") && p.ends_with("end\nend\n")));
+        assert_eq!(whole[1], Upload::Program("set_digital_out(1, True)\n".into()));
+        assert_eq!(whole[2], Upload::StopProgram);
+        for portion in [1, 2, 3, 7, 50] {
+            let mut c = Collector::default();
+            let parts: Vec<Upload> = TEXT.as_bytes().chunks(portion).flat_map(|b| c.push(b).unwrap()).collect();
+            assert_eq!(parts, whole);
+        }
+    }
+
+    #[test]
+    fn an_unfinished_last_line_does_not_start() {
+        let mut c = Collector::default();
+        assert_eq!(c.push(b"def a():\nend").unwrap(), []);
+        assert_eq!(c.push(b"\n").unwrap().len(), 1);
+    }
+
+    #[test]
+    fn memory_is_bounded() {
+        let mut c = Collector::default();
+        let block = [b'x'; 4096];
+        assert!((0..300).any(|_| c.push(&block).is_err()));
+    }
+}
