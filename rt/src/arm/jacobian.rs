@@ -17,9 +17,9 @@ impl Dh {
         let gripper_from_base = base_from_gripper.rotation.inverse();
         let p = base_from_gripper.translation.vector;
         let mut j = Matrix6::zeros();
-        for i in 0..6 {
-            let z = frames[i].rotation * Vec3::z();
-            let v = gripper_from_base * z.cross(&(p - frames[i].translation.vector));
+        for (i, frame) in frames.iter().take(6).enumerate() {
+            let z = frame.rotation * Vec3::z();
+            let v = gripper_from_base * z.cross(&(p - frame.translation.vector));
             let w = gripper_from_base * z;
             j.set_column(i, &Vector6::new(v.x, v.y, v.z, w.x, w.y, w.z));
         }

@@ -46,7 +46,6 @@ pub struct CommandCycle {
     probe: Option<Probe>,
     work: Work,
     last_ns: Option<u64>,
-    stopping_since_ns: u64,
     /// Low-passed correction, for convergence.
     filtered: Twist,
     steady: u32,
@@ -103,7 +102,6 @@ impl CommandCycle {
             probe: None,
             work: Work::default(),
             last_ns: None,
-            stopping_since_ns: 0,
             filtered: Twist::zeros(),
             steady: 0,
             best_left_m: f64::INFINITY,
@@ -152,13 +150,11 @@ impl CommandCycle {
         if let Some(cause) = self.fault(now, dt_ns, back, input.internal_fault) {
             self.apply(Event::Fault(cause), Why::Fault(cause), now, &mut event);
         }
-        if self.mode.drives() {
-            if let Some(cause) = self.hold(missed_lately) {
-                self.apply(Event::Hold(cause), Why::Hold(cause), now, &mut event);
-            }
+        if let Some(cause) = self.hold(missed_lately).filter(|_| self.mode.drives()) {
+            self.apply(Event::Hold(cause), Why::Hold(cause), now, &mut event);
         }
         let reply = input.request.map(|r| Reply { id: r.id, result: self.request(r.kind, now, &mut event) });
-        let setpoint_reply = input.setpoint.map(|s| self.offer(s));
+        let setpoint_reply = input.setpoint.map(|s| self.offer(s, now, &mut event));
         let ready = self.arm.fault(now, false).is_none() && self.vision.tracking(now);
         self.apply(if ready { Event::Ready } else { Event::NotReady }, Why::Readiness, now, &mut event);
 
@@ -174,7 +170,7 @@ impl CommandCycle {
         let mut stepped = false;
         if let (true, Some(q), Some(jacobian)) = (self.mode.drives(), q, jacobian) {
             match self.drive(now, dt_s, &q, &jacobian) {
-                Ok(Some(drive)) => {
+                Ok(drive) => {
                     let share = self.share();
                     stepped = true;
                     let guarded = self.guard.step(&drive.rates, &q, &jacobian, share, dt_s);
@@ -187,7 +183,6 @@ impl CommandCycle {
                     self.last_drive = Some(drive);
                     self.after_drive(now, &drive, held, &q, &mut event);
                 }
-                Ok(None) => {}
                 Err(cause) => {
                     self.apply(Event::Hold(cause), Why::Hold(cause), now, &mut event);
                 }
@@ -299,7 +294,6 @@ impl CommandCycle {
         match (action, e) {
             (Action::Begin, Event::Servo(_)) => self.begin(now),
             (Action::RampDown, _) => {
-                self.stopping_since_ns = now;
                 self.work.clear();
                 if let Some(m) = &mut self.motion {
                     m.reference.halt();
@@ -351,7 +345,7 @@ impl CommandCycle {
     }
 
     /// Accepts a set-point where nothing moves.
-    fn offer(&mut self, s: &SetPoint) -> Result<(), Reject> {
+    fn offer(&mut self, s: &SetPoint, now: u64, event: &mut Option<Transition>) -> Result<(), Reject> {
         if !matches!(self.mode, Mode::Idle | Mode::Tracking | Mode::Armed | Mode::Fault(_)) {
             return Err(Reject::Moving);
         }
@@ -359,7 +353,7 @@ impl CommandCycle {
         self.setpoint = Some(*s);
         // What was armed was armed for another goal.
         if matches!(self.mode, Mode::Armed) {
-            self.mode = Mode::Tracking;
+            self.apply(Event::Disarm, Why::Request(RequestKind::Disarm), now, event);
         }
         Ok(())
     }
@@ -388,14 +382,14 @@ impl CommandCycle {
         reduced.min(probe)
     }
 
-    /// The law's beat. `Ok(None)` when there is nothing to drive by.
+    /// The law's beat; without a picture or a way it holds.
     fn drive(
         &mut self,
         now: u64,
         dt_s: f64,
         q: &Joints,
         jacobian: &nalgebra::Matrix6<f64>,
-    ) -> Result<Option<Drive>, HoldCause> {
+    ) -> Result<Drive, HoldCause> {
         let share = self.share();
         let pace = Pace {
             dt_s,
@@ -406,15 +400,16 @@ impl CommandCycle {
             velocity: self.limits.velocity,
         };
         let best = self.setpoint.map_or(crate::geom::View::Left, |s| s.best_view);
-        let (Some(seen), Some(motion)) = (self.vision.seen(), &mut self.motion) else { return Ok(None) };
-        motion.drive(&self.config, seen, q, jacobian, pace, best).map(Some)
+        let (Some(seen), Some(motion)) = (self.vision.seen(), &mut self.motion) else {
+            return Err(HoldCause::MarksLost);
+        };
+        motion.drive(&self.config, seen, q, jacobian, pace, best)
     }
 
     /// Judges probe, convergence and progress after a beat of the law.
     fn after_drive(&mut self, now: u64, d: &Drive, held: Held, q: &Joints, event: &mut Option<Transition>) {
-        if held.has(Held::NOT_FINITE) {
-            self.broken_beats += 1;
-        } else if held.has(Held::CEILING) {
+        // The law scales its own rates to the caps, so either of these is a defect of ours.
+        if held.has(Held::NOT_FINITE) || held.has(Held::CEILING) {
             self.broken_beats = self.broken_beats.saturating_add(1);
         }
         if let Some(cause) = self.cornered(now, d, held, q) {

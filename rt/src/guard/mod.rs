@@ -159,10 +159,10 @@ impl Guard {
         let l = &self.limits;
         let mut scale = 1.0_f64;
         let mut fastest = 0.0_f64;
-        for i in 0..6 {
-            let speed = math::fabs(wanted[i]);
+        for (v, cap) in wanted.iter().zip(l.velocity) {
+            let speed = math::fabs(*v);
             fastest = fastest.max(speed);
-            let cap = l.velocity[i] * share;
+            let cap = cap * share;
             if speed * scale > cap {
                 scale = cap / speed;
                 held.add(Held::VELOCITY);
@@ -177,8 +177,7 @@ impl Guard {
             scale = cap / tcp;
             held.add(Held::TCP);
         }
-        for i in 0..6 {
-            let v = wanted[i];
+        for (i, &v) in wanted.iter().enumerate() {
             if v == 0.0 {
                 continue;
             }

@@ -377,3 +377,42 @@ impl Reject {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn codes_are_all_different() {
+        let faults = [
+            FaultCause::FramesStale { age_ns: 0, limit_ns: 0 },
+            FaultCause::FrameStamps { count: 0 },
+            FaultCause::MarksJumped { jump_m: 0.0, limit_m: 0.0 },
+            FaultCause::MotionMismatch { joints_m: 0.0, difference_m: 0.0 },
+            FaultCause::WrongWay { agreement: 0.0, moved_m: 0.0 },
+            FaultCause::LawBroken { beats: 0 },
+            FaultCause::LinkLost,
+            FaultCause::StateStale { age_ns: 0, limit_ns: 0 },
+            FaultCause::EchoStopped { for_ns: 0 },
+            FaultCause::SendBlocked { count: 0 },
+            FaultCause::ProtectiveStop,
+            FaultCause::EmergencyStop,
+            FaultCause::SafeguardStop,
+            FaultCause::SafetyFault { bits: 0 },
+            FaultCause::NotRunning { mode: 0 },
+            FaultCause::ProgramStopped { runtime_state: 0 },
+            FaultCause::ScriptFault { word: 0 },
+            FaultCause::TokenChanged { expected: 0, found: 0 },
+            FaultCause::ClockBack { by_s: 0.0 },
+            FaultCause::TrackingError { joint: 0, velocity: 0.0, position: 0.0 },
+            FaultCause::Uncommanded { joint: 0, velocity: 0.0 },
+            FaultCause::StateAbsurd { joint: 0, value: 0.0 },
+            FaultCause::Stalled { for_ns: 0 },
+            FaultCause::TimeBack,
+            FaultCause::Internal,
+        ];
+        for (i, a) in faults.iter().enumerate() {
+            assert!(faults[..i].iter().all(|b| a.code() != b.code()), "{}", a.code());
+        }
+    }
+}

@@ -342,6 +342,41 @@ mod tests {
     }
 
     #[test]
+    fn the_predicted_deviation_is_the_one_that_noise_makes() {
+        let goal = Pose::translation(0.05, -0.04, 1.5) * exp_twist(&Twist::new(0.0, 0.0, 0.0, 2.6, 0.3, 0.2));
+        let cam = camera();
+        let view = PlacedView::new(&cam, &goal);
+        let settings =
+            LawSettings { views: ViewMode::Left, damping_px_per_m: 0.01, floor_sigma_px: 0.0, ..Default::default() };
+        let (mut shift, mut turn, mut predicted) = (0.0, 0.0, (0.0, 0.0));
+        let mut state = 1_u64;
+        // Sum of twelve even numbers: near enough to normal, deviation 1.
+        let mut normal = || {
+            (0..12).fold(-6.0, |t, _| {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                t + (state >> 11) as f64 / (1_u64 << 53) as f64
+            })
+        };
+        let trials = 2000;
+        for _ in 0..trials {
+            let mut s = Stack::new(&settings);
+            for x in &marks() {
+                let reference = view.project(x).unwrap();
+                let now = reference + Pixel::new(0.1 * normal(), 0.1 * normal());
+                let mark = MarkError { now, reference, covariance: Matrix2::identity() * 0.01, factor: 1.0 };
+                s.add(&view, &view, x, &mark);
+            }
+            let found = s.solve().unwrap();
+            shift += found.correction.fixed_rows::<3>(0).norm_squared();
+            turn += found.correction.fixed_rows::<3>(3).norm_squared();
+            predicted = (found.sigma_m, found.sigma_rad);
+        }
+        let ratio = |sum: f64, sigma: f64| math::sqrt(sum / f64::from(trials)) / sigma;
+        assert!((ratio(shift, predicted.0) - 1.0).abs() < 0.1, "{}", ratio(shift, predicted.0));
+        assert!((ratio(turn, predicted.1) - 1.0).abs() < 0.1, "{}", ratio(turn, predicted.1));
+    }
+
+    #[test]
     fn too_few_or_collinear_marks_are_refused_with_figures() {
         let goal = Pose::translation(0.0, 0.0, 1.5);
         let s = LawSettings { views: ViewMode::Left, ..Default::default() };
