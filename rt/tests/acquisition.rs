@@ -102,19 +102,19 @@ fn many(scenes: usize, seed: u64, others: usize, blobs: usize, missing: usize) -
 
 #[test]
 fn a_gripper_alone_is_always_found() {
-    assert_eq!(many(25, 1, 0, 0, 0), (25, 0));
+    assert_eq!(many(15, 1, 0, 0, 0), (15, 0));
 }
 
 #[test]
 fn among_tens_of_other_discs_it_is_found_and_never_wrongly() {
-    let (found, wrong) = many(110, 2, 24, 20, 2);
-    assert!(found >= 107 && wrong == 0, "{found} found, {wrong} wrong");
+    let (found, wrong) = many(90, 2, 24, 20, 2);
+    assert!(found >= 88 && wrong == 0, "{found} found, {wrong} wrong");
 }
 
 #[test]
 fn with_half_of_the_marks_hidden_it_is_mostly_found_and_never_wrongly() {
-    let (found, wrong) = many(50, 3, 16, 10, 9);
-    assert!(found >= 47 && wrong == 0, "{found} found, {wrong} wrong");
+    let (found, wrong) = many(40, 3, 16, 10, 9);
+    assert!(found >= 38 && wrong == 0, "{found} found, {wrong} wrong");
 }
 
 #[test]

@@ -91,16 +91,19 @@ impl Canvas {
     /// Gain, offset and a ramp over the picture, then noise and rounding to bytes.
     pub fn expose(&self, camera: &Exposure, random: &mut Random) -> Vec<u8> {
         let table: Vec<f32> = (0..4096).map(|_| (random.normal() * camera.noise) as f32).collect();
-        let mut out = Vec::with_capacity(self.light.len());
-        for y in 0..self.height {
+        let across: Vec<f32> = (0..self.width)
+            .map(|x| (camera.gain * camera.ramp.0 * (x as f64 / self.width as f64 - 0.5)) as f32)
+            .collect();
+        let mut out = vec![0; self.light.len()];
+        let rows = self.light.chunks_exact(self.width).zip(out.chunks_exact_mut(self.width));
+        for (y, (light, out)) in rows.enumerate() {
             let mut k = random.bits();
-            for x in 0..self.width {
+            let gain = (camera.gain * (1.0 + camera.ramp.1 * (y as f64 / self.height as f64 - 0.5))) as f32;
+            let offset = camera.offset as f32 + 0.5;
+            for ((o, l), a) in out.iter_mut().zip(light).zip(&across) {
                 k = k.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-                let ramp = 1.0
-                    + camera.ramp.0 * (x as f64 / self.width as f64 - 0.5)
-                    + camera.ramp.1 * (y as f64 / self.height as f64 - 0.5);
-                let v = f64::from(self.light[y * self.width + x]) * camera.gain * ramp + camera.offset;
-                out.push((v + f64::from(table[(k >> 52) as usize]) + 0.5).clamp(0.0, 255.0) as u8);
+                // A float to byte conversion saturates by itself.
+                *o = (l * (gain + a) + offset + table[(k >> 52) as usize]) as u8;
             }
         }
         out

@@ -38,9 +38,14 @@ pub(crate) fn find(
     }
     let mut v = [0.0_f64; MAX_SAMPLES];
     let v = v.get_mut(..count)?;
-    for (i, v) in v.iter_mut().enumerate() {
-        let p = base + point.normal * (i as f64 * STEP - inward);
-        *v = sign * image.sample(p.x, p.y)?;
+    let (from, step) = (base - point.normal * inward, point.normal * STEP);
+    if !image.profile(from.x, from.y, step.x, step.y, v) {
+        return None;
+    }
+    if sign < 0.0 {
+        for v in v.iter_mut() {
+            *v = -*v;
+        }
     }
     // The step between samples i and i + 1, from the NEAR samples on either side.
     let (mut at, mut best) = (0, 0.0);
