@@ -106,7 +106,7 @@ fn the_wrong_way_is_noticed_by_the_probe() {
 fn any_fault_at_any_instant_ends_at_rest() {
     type Set = fn(&mut Faults);
     // Fault, code, milliseconds to the first slower set-point.
-    let table: [(Set, &str, u64); 19] = [
+    let table: [(Set, &str, u64); 24] = [
         (|f| f.no_vision = true, "F-CAM-01", 150),
         (|f| f.no_state = true, "F-ARM-02", 25),
         (|f| f.link_down = true, "F-ARM-01", 4),
@@ -121,6 +121,11 @@ fn any_fault_at_any_instant_ends_at_rest() {
         (|f| f.clock_back = true, "F-ARM-13", 4),
         (|f| f.nan_state = true, "F-ARM-16", 4),
         (|f| f.jump_state = true, "F-ARM-16", 4),
+        (|f| f.blocked = true, "F-ARM-04", 26),
+        (|f| f.script_fault = true, "F-ARM-11", 4),
+        (|f| f.internal = true, "F-INT-01", 4),
+        (|f| f.old_stamps = true, "F-CAM-02", 90),
+        (|f| f.skewed = true, "H-08", 90),
         (|f| f.stall = true, "F-TIM-01", 32),
         (|f| f.lost_marks = true, "H-01", 90),
         (|f| f.nan_marks = true, "H-01", 60),

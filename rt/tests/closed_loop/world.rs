@@ -61,6 +61,11 @@ pub(crate) struct Faults {
     pub(crate) nan_marks: bool,
     pub(crate) jump_marks: bool,
     pub(crate) stall: bool,
+    pub(crate) blocked: bool,
+    pub(crate) script_fault: bool,
+    pub(crate) internal: bool,
+    pub(crate) old_stamps: bool,
+    pub(crate) skewed: bool,
     /// Beats come up to this share of a period early or late.
     pub(crate) jitter: f64,
     pub(crate) slider_zero: bool,
@@ -261,7 +266,7 @@ impl World {
             digital_outputs: 0,
             echo: if f.echo_stuck { 12345 } else { beat },
             script_state: 1,
-            script_fault: 0,
+            script_fault: i32::from(f.script_fault),
             script_token: if f.token { 99 } else { 42 },
         };
         if f.nan_state {
@@ -313,6 +318,12 @@ impl World {
                     *v = Vision { sequence, capture_ns, ..*old };
                 }
             }
+            if self.faults.old_stamps {
+                v.capture_ns = [self.now + 50 * MS; 2];
+            }
+            if self.faults.skewed {
+                v.capture_ns[1] -= 6 * MS;
+            }
             if self.faults.lost_marks {
                 v.status = VisionStatus::Lost;
                 v.marks = [[None; MAX_MARKS]; 2];
@@ -336,11 +347,15 @@ impl World {
         let output = self.cycle.step(&CommandInput {
             now_ns: self.now,
             robot: (!self.faults.no_state && !self.faults.link_down).then_some(state),
-            link: LinkStatus { connected: !self.faults.link_down, token: 42, blocked_sends: 0 },
+            link: LinkStatus {
+                connected: !self.faults.link_down,
+                token: 42,
+                blocked_sends: u32::from(self.faults.blocked),
+            },
             vision: vision.as_ref(),
             request: request.map(|kind| Request { id: 1, kind }),
             setpoint: offer.then_some(&self.setpoint),
-            internal_fault: false,
+            internal_fault: self.faults.internal,
         });
         self.step_ns.push(before.elapsed().as_nanos() as u64);
         self.pending = output.command;
