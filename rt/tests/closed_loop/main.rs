@@ -1,4 +1,5 @@
 //! The command cycle in lock step with a simulated arm and rig: does it arrive, and does it always stop?
+#![allow(clippy::unwrap_used)] // helpers of tests
 
 mod world;
 
@@ -14,11 +15,9 @@ fn converge(w: &mut World, limit_s: u64) -> Option<f64> {
     let begin = w.now;
     while w.now < begin + limit_s * 1_000 * MS {
         let out = w.beat(None, false);
-        if let Some(e) = out.event {
-            if !matches!(e.to, ModeName::Converged) {
-                println!("{e:?} left {:?}", w.error_to(&w.setpoint.grasp.left_from_gripper));
-                return None;
-            }
+        if let Some(e) = out.event.filter(|e| e.to != ModeName::Converged) {
+            println!("{e:?} left {:?}", w.error_to(&w.setpoint.grasp.left_from_gripper));
+            return None;
         }
         if out.record.mode == ModeName::Converged {
             return Some((w.now - begin) as f64 * 1e-9);
@@ -147,11 +146,8 @@ fn any_fault_at_any_instant_ends_at_rest() {
             let limit = injected + bound_ms * MS + w.cycle.limits().ramp_ns() + 4 * MS;
             while w.now < limit {
                 let out = w.beat(None, false);
-                if let Some(e) = out.event {
-                    if let (None, Why::Fault(_) | Why::Hold(_)) = (named, e.why) {
-                        named = Some((e.why, w.now - injected));
-                    }
-                }
+                let cause = out.event.map(|e| e.why).filter(|why| matches!(why, Why::Fault(_) | Why::Hold(_)));
+                named = named.or(cause.map(|why| (why, w.now - injected)));
                 w.faults.stall = false;
             }
             let (why, after) = named.unwrap_or_else(|| panic!("{code} was not noticed"));
@@ -265,9 +261,9 @@ fn random_requests_and_faults_never_move_an_arm_that_is_not_servoing() {
             let r = requests[(w.rng.next() % requests.len() as u64) as usize];
             // Often enough the right order, so that it moves at all.
             let r = match w.cycle.mode().name() {
-                ModeName::Tracking if w.rng.next() % 2 == 0 => RequestKind::Arm,
-                ModeName::Armed if w.rng.next() % 2 == 0 => RequestKind::Servo,
-                ModeName::Fault if w.rng.next() % 2 == 0 => RequestKind::Reset,
+                ModeName::Tracking if w.rng.next().is_multiple_of(2) => RequestKind::Arm,
+                ModeName::Armed if w.rng.next().is_multiple_of(2) => RequestKind::Servo,
+                ModeName::Fault if w.rng.next().is_multiple_of(2) => RequestKind::Reset,
                 _ => r,
             };
             let f = &mut w.faults;
@@ -283,7 +279,7 @@ fn random_requests_and_faults_never_move_an_arm_that_is_not_servoing() {
                 6 => w.faults.jump_marks = true,
                 _ => {}
             }
-            let offer = w.rng.next() % 3 == 0;
+            let offer = w.rng.next().is_multiple_of(3);
             let mut out = w.beat(Some(r), offer);
             for _ in 0..w.rng.next() % 200 {
                 let still =

@@ -1,4 +1,5 @@
 //! A world in lock step: an arm that is not quite the model, a rig placed at random, marks as points.
+#![allow(clippy::unwrap_used)] // a test's own world: a surprise in it has to be loud
 
 use graspd_rt::arm::{ArmCommand, ArmMode, Dh, Joints, Model, READY, RobotState};
 use graspd_rt::cycle::{
@@ -189,7 +190,7 @@ impl World {
         let seen = plan(&self.config, goal).marks;
         let rig = &mut self.config.rig;
         for c in [&mut rig.left, &mut rig.right] {
-            let k = 1.0 + if self.rng.next() % 2 == 0 { 5e-3 } else { -5e-3 };
+            let k = 1.0 + if self.rng.next().is_multiple_of(2) { 5e-3 } else { -5e-3 };
             c.fx *= k;
             c.fy *= k;
         }
@@ -292,8 +293,8 @@ impl World {
         if self.faults.stuck_arm {
             target = [0.0; 6];
         }
-        for i in 0..6 {
-            let mut wish = target[i] * slider * self.sense;
+        for (i, target) in target.iter().enumerate() {
+            let mut wish = target * slider * self.sense;
             if self.faults.drift_arm {
                 wish += 0.03;
             }
@@ -312,11 +313,9 @@ impl World {
             vision = self.pipeline.pop_front().map(|(_, v)| v);
         }
         if let Some(v) = &mut vision {
-            if self.faults.frozen_vision {
-                if let Some(old) = &self.last_vision {
-                    let (sequence, capture_ns) = (v.sequence, v.capture_ns);
-                    *v = Vision { sequence, capture_ns, ..*old };
-                }
+            if let Some(old) = self.last_vision.as_ref().filter(|_| self.faults.frozen_vision) {
+                let (sequence, capture_ns) = (v.sequence, v.capture_ns);
+                *v = Vision { sequence, capture_ns, ..*old };
             }
             if self.faults.old_stamps {
                 v.capture_ns = [self.now + 50 * MS; 2];
@@ -387,9 +386,9 @@ impl World {
         let (v, a) = (l.velocity(), l.acceleration());
         for pair in self.sent.windows(2) {
             let dt = ((pair[1].0 - pair[0].0) as f64 * 1e-9).min(self.period as f64 * 1e-9);
-            for i in 0..6 {
+            for (i, v) in v.iter().enumerate() {
                 let (x, y) = (pair[0].1[i], pair[1].1[i]);
-                assert!(y.is_finite() && y.abs() <= v[i] * (1.0 + 1e-9), "joint {i} at {y}");
+                assert!(y.is_finite() && y.abs() <= v * (1.0 + 1e-9), "joint {i} at {y}");
                 assert!((y - x).abs() <= a * dt * (1.0 + 1e-9), "joint {i}: {x} to {y} in {dt}");
             }
         }
