@@ -171,6 +171,10 @@ impl Parser<'_> {
     }
 
     fn primary(&mut self) -> Result<Expr, ScriptError> {
+        // A value that is due may stand on a later line.
+        while matches!(self.peek(), Some(Token::Newline)) {
+            self.advance();
+        }
         let line = self.line();
         let literal = |value| node(ExprKind::Literal(value), line, 0);
         match self.peek() {

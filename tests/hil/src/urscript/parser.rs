@@ -142,13 +142,20 @@ impl<'t> Parser<'t> {
                 break;
             }
             out.push(self.statement()?);
-            let ended = matches!(self.peek(), None | Some(Token::Newline)) || self.is_symbol(";");
+            let ended =
+                matches!(self.peek(), None | Some(Token::Newline)) || self.is_symbol(";") || self.opens_statement();
             if !ended && !closers.iter().any(|c| self.is_word(c)) {
                 return Err(self.expected("the end of the statement"));
             }
         }
         self.nesting -= 1;
         Ok(out)
+    }
+
+    /// Whether a keyword follows that can only begin a statement. A line's end is not needed before it: the script that SDU's
+    /// client uploads has `global a = # comment`, and on the next line the value and the next `global`.
+    fn opens_statement(&self) -> bool {
+        ["global", "local", "def", "thread", "if", "while", "return"].iter().any(|w| self.is_word(w))
     }
 
     fn statement(&mut self) -> Result<Stmt, ScriptError> {
