@@ -56,12 +56,14 @@ fn a_thousand_well_posed_scenes_are_all_answered_and_right() {
 }
 
 #[test]
-fn ten_thousand_absurd_selections_pass_less_than_once_in_a_thousand() {
+fn absurd_selections_pass_less_than_once_in_a_thousand() {
+    // Ten thousand in release; fewer without optimisation, to keep the suite's time.
+    let trials = if cfg!(debug_assertions) { 2_000 } else { 10_000 };
     let p = rig(0.5, 1200.0, 1.5);
     let mut r = Random::new(12);
     let (mut passed, mut total) = (0, 0);
     let mut kinds = [0usize; 8];
-    while total < 10_000 {
+    while total < trials {
         let kind = total % 8;
         total += 1;
         let (a, b) = (random_rim(&mut r), random_rim(&mut r));
