@@ -5,3 +5,4 @@ pub mod files;
 pub mod golden;
 pub mod montecarlo;
 pub mod offline;
+pub mod plan_cli;

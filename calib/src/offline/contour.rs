@@ -16,6 +16,8 @@ use graspd_rt::geom::{Camera, Pixel};
 const INDEPENDENT_PX: f64 = 3.5;
 /// Uncertainty of an edge that no pixel noise explains: lens residue, detector non-uniformity, the rim's own roughness.
 const FLOOR_PX: f64 = 0.03;
+/// Edges that scatter more about their ellipse belong to several contours. A round bar's outline, which is none, stays below half of it.
+const MOST_SCATTER_PX: f64 = 0.9;
 /// Smallest part of an ellipse that has to carry edges.
 pub(super) const LEAST_COVERAGE: f64 = 0.25;
 
@@ -268,6 +270,24 @@ impl<'a> ViewEdges<'a> {
         Some(best)
     }
 
+    /// The same without a seed: the ellipse may settle where its edges are.
+    pub(super) fn settle_free(&self, start: Trial) -> Option<Trial> {
+        let mut best = start;
+        for k in 0..6 {
+            let mut sums = Sums::new(best.ellipse.centre, best.ellipse.a);
+            for e in best.hits.iter().filter_map(|k| self.arcs.ideal.get(*k as usize)) {
+                sums.add(e.at, 1.0);
+            }
+            let t = self.judge(&sums.ellipse()?, best.bright_inside, if k < 2 { 3.0 } else { 2.0 })?;
+            let same = alike(&t.ellipse, &best.ellipse) && t.hits.len() == best.hits.len();
+            best = t;
+            if same {
+                break;
+            }
+        }
+        Some(best)
+    }
+
     /// The contour of a trial: edges by consensus, thinned, refined, with their ellipse. `None` when too little is left.
     pub(super) fn contour(&self, trial: &Trial) -> Option<Contour> {
         let sign = if trial.bright_inside { -1.0 } else { 1.0 };
@@ -403,7 +423,7 @@ impl<'a> ViewEdges<'a> {
         let rms_px = (points.iter().map(|p| p.residual * p.residual).sum::<f64>() / n).sqrt();
         let coverage = (n / bins as f64).min(1.0);
         rejected.sort_by(|a, b| a.y.total_cmp(&b.y).then(a.x.total_cmp(&b.x)));
-        (coverage >= LEAST_COVERAGE).then_some(Contour {
+        (coverage >= LEAST_COVERAGE && rms_px <= MOST_SCATTER_PX).then_some(Contour {
             ellipse: e,
             bright_inside: sign < 0.0,
             points,

@@ -6,6 +6,7 @@ use super::grasp::object_frame;
 use super::lens::Lens;
 use super::picture::Picture;
 use super::plan::{Plan, model_name};
+use super::propose::Proposal;
 use super::quick_fit::Walk;
 use crate::files::{GripperFile, OrientedBox, RigFile};
 use graspd_rt::geom::{Pixel, Pose, Vec3, View};
@@ -255,6 +256,45 @@ pub fn draw(plan: &Plan, pictures: [&Picture; 2], rig: &RigFile, gripper: &Gripp
     let first = rows.iter().map(Vec::len).max().unwrap_or(0) as f64;
     for (k, w) in plan.file.warnings.iter().enumerate() {
         canvas.text(Pixel::new(g, y0 + (0.5 + first + k as f64) * line), &format!("! {w}"), Face::Plain, scale, RIM);
+    }
+    canvas.png()
+}
+
+/// Draws proposals, numbered, in both views.
+pub fn draw_proposals(found: &[Proposal], pictures: [&Picture; 2], rig: &RigFile) -> Option<Vec<u8>> {
+    const COLOURS: [Rgba; 6] = [RIM, NORMAL, MARK, EDGE, [255, 140, 80, 255], [180, 160, 255, 255]];
+    let widest = pictures[0].width().max(pictures[1].width()) as f64;
+    let zoom = ((2.0 * 1100.0 / widest).round() / 2.0).clamp(0.5, 4.0);
+    let unit = (widest * zoom / 1100.0).max(0.6);
+    let s = (unit.round() as u32).max(1);
+    let mut panels = Vec::new();
+    for (k, view) in View::BOTH.iter().enumerate() {
+        let mut panel = Panel::new(pictures[k], *view, rig, zoom)?;
+        for (n, p) in found.iter().enumerate() {
+            let colour = COLOURS.get(n % COLOURS.len()).copied().unwrap_or(RIM);
+            if let Some(c) = p.contours.get(k) {
+                let walk = Walk::new(&c.ellipse);
+                let points: Vec<_> = (0..=180)
+                    .map(|i| Some(panel.raw(panel.lens.raw(walk.at(f64::from(i) * std::f64::consts::TAU / 180.0).0))))
+                    .collect();
+                panel.canvas.line(&points, [8, 10, 14, 160], 4.0 * unit, None);
+                panel.canvas.line(&points, colour, 2.0 * unit, None);
+                // The numbers stand on their own ellipses at different places, so that nested ones can be told apart.
+                let at = walk.at(4.0 + 0.7 * n as f64).0;
+                let at = panel.raw(panel.lens.raw(at));
+                panel.canvas.label(at, &format!("{}", n + 1), Face::Bold, s, colour);
+            }
+        }
+        panels.push(panel.canvas);
+    }
+    let gap = (14.0 * unit) as u32;
+    let width: u32 = panels.iter().map(|p| p.pixmap.width() + gap).sum::<u32>() + gap;
+    let height = panels.iter().map(|p| p.pixmap.height()).max()? + 2 * gap;
+    let mut canvas = Canvas::new(width, height, BACK)?;
+    let mut x = gap;
+    for p in &panels {
+        canvas.place(x as i32, gap as i32, p);
+        x += p.pixmap.width() + gap;
     }
     canvas.png()
 }

@@ -6,6 +6,7 @@ use super::lens::projection;
 use super::model::{self, Projection, Reconstruction, RimModel};
 use super::pairing::{self, Pair};
 use super::picture::Picture;
+use super::propose::{Proposal, propose};
 use super::refusal::Refusal;
 use super::select::{self, Candidate, SelectError, Selection};
 use super::setpoint::{RimObstacle, Scene, fewest_on_the_way};
@@ -150,11 +151,58 @@ pub fn plan(
 ) -> Result<Plan, PlanError> {
     let views = Views::new(pictures, rig)?;
     let [l, r] = &views.edges;
-    let left = select::contours(View::Left, l, selections[0], CANDIDATES)?;
-    let right = select::contours(View::Right, r, selections[1], CANDIDATES)?;
+    let left = select::contours(View::Left, l, selections[0], CANDIDATES);
+    let right = select::contours(View::Right, r, selections[1], CANDIDATES);
+    // Pictures given in the wrong order: each selection then belongs to the other picture.
+    let crossed = || -> Option<Refusal> {
+        let left = select::contours(View::Left, l, selections[1], 2).ok()?;
+        let right = select::contours(View::Right, r, selections[0], 2).ok()?;
+        let p = [&views.p[0], &views.p[1]];
+        pairing::pair([l, r], [&left, &right], p, &options.rim).err().filter(|u| u.swapped_fits).map(|u| u.refusal)
+    };
+    let (left, right) = match (left, right) {
+        (Ok(l), Ok(r)) => (l, r),
+        (Err(e), _) | (_, Err(e)) => {
+            return Err(crossed().map_or(PlanError::Select(e), |as_given| PlanError::Swapped { as_given }));
+        }
+    };
     let record = selections.map(|s| SelectionRecord {
         kind: s.kind().to_owned(),
         points_px: s.pixels().iter().map(|p| [p.x, p.y]).collect(),
+    });
+    from_candidates(&views, [&left, &right], record, pictures, rig, gripper, options).map_err(|e| match e {
+        PlanError::Rim(as_given) => match crossed() {
+            Some(as_given) => PlanError::Swapped { as_given },
+            None => PlanError::Rim(as_given),
+        },
+        other => other,
+    })
+}
+
+/// Ellipses proposed without a selection, ranked, at most `most`.
+pub fn proposals(
+    pictures: [&Picture; 2],
+    rig: &RigFile,
+    options: &PlanOptions,
+    most: usize,
+) -> Result<Vec<Proposal>, PlanError> {
+    let views = Views::new(pictures, rig)?;
+    Ok(propose(&views.edges, [&views.p[0], &views.p[1]], &options.rim, most))
+}
+
+/// Plans a grasp on a proposal.
+pub fn plan_proposal(
+    pictures: [&Picture; 2],
+    proposal: &Proposal,
+    rig: &RigFile,
+    gripper: &GripperFile,
+    options: &PlanOptions,
+) -> Result<Plan, PlanError> {
+    let views = Views::new(pictures, rig)?;
+    let [left, right] = proposal.candidates();
+    let record = [0, 1].map(|k| SelectionRecord {
+        kind: "auto".to_owned(),
+        points_px: proposal.contours[k].points.first().map(|p| [p.raw.x, p.raw.y]).into_iter().collect(),
     });
     from_candidates(&views, [&left, &right], record, pictures, rig, gripper, options)
 }
@@ -170,11 +218,10 @@ pub(super) fn from_candidates(
     options: &PlanOptions,
 ) -> Result<Plan, PlanError> {
     let p = [&views.p[0], &views.p[1]];
-    let found = pairing::pair(candidates[0], candidates[1], p, &options.rim).map_err(|u| {
+    let found = pairing::pair([&views.edges[0], &views.edges[1]], candidates, p, &options.rim).map_err(|u| {
         if u.swapped_fits { PlanError::Swapped { as_given: u.refusal } } else { PlanError::Rim(u.refusal) }
     })?;
-    let Pair { contours, reconstruction, .. } = found;
-    let inner = [None, None];
+    let Pair { contours, inner, reconstruction, .. } = found;
     let grasp = grasp::choose(&rig.rig, gripper, &reconstruction, &options.approach)?;
     let mut plan = assemble(contours, inner, reconstruction, grasp, rig, gripper, options);
     plan.file.pictures = Some(pair_of(pictures.map(|p| PictureRecord {

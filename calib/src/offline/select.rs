@@ -65,7 +65,7 @@ pub enum SelectError {
         nearest: Option<Pixel>,
     },
     /// Edges, but no ellipse.
-    #[error("the edges near the {} selection ({:.1}, {:.1}) belong to no ellipse (the best one has edges on {percent:.0} % of its outline, at least {least:.0} % are needed): click the rim itself, or several points on it", name(.view), at.x, at.y)]
+    #[error("the edges near the {} selection ({:.1}, {:.1}) belong to no ellipse (the best one has edges on {percent:.0} % of its outline; at least {least:.0} % are needed, on one smooth line): click the rim itself, or several points on it", name(.view), at.x, at.y)]
     NoEllipse {
         /// The view.
         view: View,
