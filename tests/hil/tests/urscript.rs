@@ -101,6 +101,13 @@ fn loops_branches_and_element_assignment() {
 }
 
 #[test]
+fn a_value_on_the_next_line_and_a_keyword_after_it_are_taken() {
+    // A real client library uploads this, and controllers run it.
+    let out = log("global a = # comment\n0    global b = 2\nif a == 0: textmsg(b) end\ntextmsg(a)");
+    assert_eq!(out, ["2", "0"]);
+}
+
+#[test]
 fn syntax_errors_carry_the_line_and_nothing_runs() {
     for (text, line, part) in [
         ("def t():\n x = = 1\nend\n", 2, "expected a value"),

@@ -220,6 +220,7 @@ fn immediate(name: &str, a: &[Value], host: &mut dyn Host) -> Outcome {
         }
         "get_actual_tcp_pose" => Value::Pose(host.view().tcp_pose_actual),
         "get_target_tcp_pose" => Value::Pose(host.view().tcp_pose_target),
+        "get_actual_tool_flange_pose" => Value::Pose(host.forward_kinematics(&host.view().q_actual, Some(&[0.0; 6]))),
         "get_actual_tcp_speed" => Value::Pose(host.view().tcp_speed_actual),
         "get_target_tcp_speed" => Value::Pose(host.view().tcp_speed_target),
         "get_actual_joint_positions" => Value::floats(&host.view().q_actual),

@@ -1,4 +1,4 @@
-//! Text to tokens, with line numbers. Indentation means nothing; a line's end ends a statement except within brackets.
+//! Text to tokens, with line numbers. Indentation means nothing; a line's end means nothing within brackets.
 
 use super::error::ScriptError;
 

@@ -4,6 +4,18 @@
 //! step of it: every thread goes on until it has used its controller time. All that a program can see or move outside itself goes
 //! through [`Host`]: registers, joints, outputs, sockets. The interpreter starts no operating-system threads and reads no clock.
 //!
+//! How to host it:
+//! - feed each script connection's bytes to a [`Collector`]; it gives whole programs and the `stop program` line;
+//! - a [`ProgramKind::Main`] or [`ProgramKind::Bare`] machine replaces the running one (call [`Machine::stop`] on that first), a
+//!   [`ProgramKind::Secondary`] one is stepped once beside it;
+//! - in each control step: update the plant and the registers, call [`Machine::step`] unless the program is paused, then move the
+//!   plant by the motion last given to [`Host::motion_start`]. A motion is polled from the step after its start, so the shortest
+//!   call takes one step;
+//! - at any outcome but `Running`, at a watchdog's stop and at a safety stop the program is over: watchdogs go away and the host
+//!   brings the arm to rest;
+//! - `is_within_safety_limits`, `get_freedrive_status`, `get_target_payload_inertia`, `tool_contact`,
+//!   `get_actual_joint_positions_history` and whatever else a client's script may name arrive at [`Host::call`].
+//!
 //! Rules of the language come from UR's script manual and the behaviour of UR's and SDU's published scripts. Where a robot's
 //! behaviour is not documented, the stricter reading is taken, so that a script which runs here has a better chance there.
 

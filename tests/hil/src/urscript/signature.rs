@@ -38,6 +38,7 @@ const SIGNATURES: &[(&str, &str)] = &[
     // State.
     ("get_actual_tcp_pose", ""),
     ("get_target_tcp_pose", ""),
+    ("get_actual_tool_flange_pose", ""),
     ("get_actual_tcp_speed", ""),
     ("get_target_tcp_speed", ""),
     ("get_actual_joint_positions", ""),
