@@ -7,5 +7,7 @@ pub mod arm;
 pub mod cli;
 pub mod config;
 pub mod exit;
+pub mod links;
 pub mod realtime;
 pub mod threads;
+pub mod wiring;

@@ -1,2 +1,54 @@
-//! The graspd program.
-fn main() {}
+//! The graspd program: parses the command line, runs one subcommand, ends with its code.
+
+use clap::Parser;
+use graspd::cli::{self, Cli, Command};
+use graspd::exit::{Exit, Failure};
+use graspd_shm::control::Verb;
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(e) => {
+            // Help and version are no errors; clap prints both to the right stream.
+            let code = if e.use_stderr() { Exit::Usage.code() } else { 0 };
+            let _ = e.print();
+            return ExitCode::from(code);
+        }
+    };
+    match run(cli.command) {
+        Ok(exit) => ExitCode::from(exit.code()),
+        Err(failure) => {
+            eprintln!("graspd: {failure}");
+            ExitCode::from(failure.exit.code())
+        }
+    }
+}
+
+fn run(command: Command) -> Result<Exit, Failure> {
+    match command {
+        #[cfg(feature = "demo")]
+        Command::Demo(args) => cli::demo::run(&args),
+        #[cfg(not(feature = "demo"))]
+        Command::Demo(_) => Err(Failure {
+            exit: Exit::Usage,
+            message: "this build has no demo in it; build with the feature 'demo'".into(),
+        }),
+        Command::Plan(args) => cli::plan(&args),
+        Command::Run(args) => cli::run(&args),
+        Command::Check(args) => cli::check(&args),
+        Command::Status(args) => cli::send(&args, Verb::Status, b""),
+        Command::Arm(args) => cli::send(&args, Verb::Arm, b""),
+        Command::Servo(args) => cli::send(&args, Verb::Servo, b""),
+        Command::Stop(args) => cli::send(&args, Verb::Stop, b""),
+        Command::Reset(args) => cli::send(&args, Verb::Reset, b""),
+        Command::Recover(args) => cli::send(&args, Verb::Recover, b""),
+        Command::Setpoint(args) => cli::setpoint(&args),
+        Command::Reconstruct(args) => cli::reconstruct(&args),
+        Command::Study(args) => cli::study(&args),
+        #[cfg(feature = "demo")]
+        Command::MockUr(p) => Ok(cli::world(|a| graspd_hil::controller::main_with_args(a), "graspd-mock-ur", &p.args)),
+        #[cfg(feature = "demo")]
+        Command::Scene(p) => Ok(cli::world(|a| graspd_hil::scene::main_with_args(a), "graspd-scene", &p.args)),
+    }
+}

@@ -13,11 +13,11 @@ use tiny_skia::{
 };
 
 /// A colour as red, green, blue, opacity (0 to 255).
-pub(super) type Rgba = [u8; 4];
+pub type Rgba = [u8; 4];
 
 /// The sizes of labels.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Face {
+pub enum Face {
     /// Headings.
     Bold,
     /// Figures.
@@ -36,14 +36,15 @@ impl Face {
     }
 
     /// Width of a character, pixels.
-    pub(super) fn advance(self) -> f64 {
+    pub fn advance(self) -> f64 {
         f64::from(self.font().character_size.width)
     }
 }
 
 /// A drawing.
-pub(super) struct Canvas {
-    pub(super) pixmap: Pixmap,
+pub struct Canvas {
+    /// Its pixels, opaque.
+    pub pixmap: Pixmap,
 }
 
 fn paint([r, g, b, a]: Rgba) -> Paint<'static> {
@@ -55,14 +56,14 @@ fn paint([r, g, b, a]: Rgba) -> Paint<'static> {
 
 impl Canvas {
     /// An empty drawing of one colour; `None` when it would have no pixels or too many.
-    pub(super) fn new(width: u32, height: u32, [r, g, b, a]: Rgba) -> Option<Self> {
+    pub fn new(width: u32, height: u32, [r, g, b, a]: Rgba) -> Option<Self> {
         let mut pixmap = Pixmap::new(width, height)?;
         pixmap.fill(Color::from_rgba8(r, g, b, a));
         Some(Self { pixmap })
     }
 
     /// A line through points; a gap in it where a point is missing.
-    pub(super) fn line(&mut self, points: &[Option<Pixel>], colour: Rgba, width: f64, dash: Option<[f64; 2]>) {
+    pub fn line(&mut self, points: &[Option<Pixel>], colour: Rgba, width: f64, dash: Option<[f64; 2]>) {
         let mut b = PathBuilder::new();
         let mut down = false;
         for p in points {
@@ -87,12 +88,12 @@ impl Canvas {
     }
 
     /// A straight line.
-    pub(super) fn segment(&mut self, a: Pixel, b: Pixel, colour: Rgba, width: f64) {
+    pub fn segment(&mut self, a: Pixel, b: Pixel, colour: Rgba, width: f64) {
         self.line(&[Some(a), Some(b)], colour, width, None);
     }
 
     /// A filled polygon.
-    pub(super) fn area(&mut self, points: &[Pixel], colour: Rgba) {
+    pub fn area(&mut self, points: &[Pixel], colour: Rgba) {
         let mut b = PathBuilder::new();
         for (k, p) in points.iter().enumerate() {
             if !(p.x.abs() < 1e5 && p.y.abs() < 1e5) {
@@ -107,14 +108,14 @@ impl Canvas {
     }
 
     /// A filled disc.
-    pub(super) fn dot(&mut self, at: Pixel, radius: f64, colour: Rgba) {
+    pub fn dot(&mut self, at: Pixel, radius: f64, colour: Rgba) {
         if let Some(path) = PathBuilder::from_circle(at.x as f32, at.y as f32, radius as f32) {
             self.pixmap.fill_path(&path, &paint(colour), FillRule::Winding, Transform::identity(), None);
         }
     }
 
     /// A ring.
-    pub(super) fn ring(&mut self, at: Pixel, radius: f64, colour: Rgba, width: f64) {
+    pub fn ring(&mut self, at: Pixel, radius: f64, colour: Rgba, width: f64) {
         if let Some(path) = PathBuilder::from_circle(at.x as f32, at.y as f32, radius as f32) {
             let stroke = Stroke { width: width as f32, ..Stroke::default() };
             self.pixmap.stroke_path(&path, &paint(colour), &stroke, Transform::identity(), None);
@@ -122,14 +123,14 @@ impl Canvas {
     }
 
     /// A filled rectangle.
-    pub(super) fn rectangle(&mut self, x: f64, y: f64, w: f64, h: f64, colour: Rgba) {
+    pub fn rectangle(&mut self, x: f64, y: f64, w: f64, h: f64, colour: Rgba) {
         if let Some(r) = Rect::from_xywh(x as f32, y as f32, w as f32, h as f32) {
             self.pixmap.fill_rect(r, &paint(colour), Transform::identity(), None);
         }
     }
 
     /// An arrow with a filled head.
-    pub(super) fn arrow(&mut self, from: Pixel, to: Pixel, colour: Rgba, width: f64) {
+    pub fn arrow(&mut self, from: Pixel, to: Pixel, colour: Rgba, width: f64) {
         let Some(d) = (to - from).try_normalize(1e-6) else { return };
         let n = Pixel::new(-d.y, d.x);
         let head = 4.5 * width;
@@ -138,7 +139,7 @@ impl Canvas {
     }
 
     /// A label whose top left corner is at a place; letters are `scale` times their bitmap.
-    pub(super) fn text(&mut self, at: Pixel, text: &str, face: Face, scale: u32, colour: Rgba) {
+    pub fn text(&mut self, at: Pixel, text: &str, face: Face, scale: u32, colour: Rgba) {
         let font = face.font();
         let style = MonoTextStyle::new(&font, BinaryColor::On);
         let mut ink = Ink {
@@ -153,7 +154,7 @@ impl Canvas {
     }
 
     /// A label with a dark rim, readable on any picture; centred at a place.
-    pub(super) fn label(&mut self, at: Pixel, text: &str, face: Face, scale: u32, colour: Rgba) {
+    pub fn label(&mut self, at: Pixel, text: &str, face: Face, scale: u32, colour: Rgba) {
         let size = face.font().character_size;
         let s = f64::from(scale.max(1));
         let w = f64::from(size.width) * s * text.chars().count() as f64;
@@ -167,12 +168,22 @@ impl Canvas {
     }
 
     /// Another drawing laid on this one.
-    pub(super) fn place(&mut self, x: i32, y: i32, other: &Self) {
+    pub fn place(&mut self, x: i32, y: i32, other: &Self) {
         self.pixmap.draw_pixmap(x, y, other.pixmap.as_ref(), &PixmapPaint::default(), Transform::identity(), None);
     }
 
+    /// Fills the drawing with grey values, row by row, each times a factor (0 to 1).
+    pub fn grey(&mut self, values: &[u8], factor: f64) {
+        for (pixel, v) in self.pixmap.pixels_mut().iter_mut().zip(values) {
+            let g = (f64::from(*v) * factor.clamp(0.0, 1.0)) as u8;
+            if let Some(c) = PremultipliedColorU8::from_rgba(g, g, g, 255) {
+                *pixel = c;
+            }
+        }
+    }
+
     /// The drawing as a PNG file.
-    pub(super) fn png(&self) -> Option<Vec<u8>> {
+    pub fn png(&self) -> Option<Vec<u8>> {
         self.pixmap.encode_png().ok()
     }
 }

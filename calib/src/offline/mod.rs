@@ -1,7 +1,7 @@
 //! The off-line stage, one file per step of the paper: from edge points in two views to a rim in space and a grasp on it.
 
 pub mod arcs;
-mod canvas;
+pub mod canvas;
 pub mod circle;
 pub mod cone;
 pub mod conic;

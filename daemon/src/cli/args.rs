@@ -122,9 +122,6 @@ pub struct StudyArgs {
     /// Seed of the study
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Machine-readable table
-    #[arg(long)]
-    pub json: bool,
 }
 
 /// `graspd plan`.

@@ -3,9 +3,19 @@
 mod args;
 mod client;
 #[cfg(feature = "demo")]
-mod demo;
+pub mod demo;
+mod plan;
+mod reconstruct;
+mod run;
+mod study;
+mod world;
 
 pub use args::{
     Cli, ClientArgs, Command, DemoArgs, PassThrough, PlanArgs, ReconstructArgs, RunArgs, SetpointArgs, StudyArgs,
 };
 pub use client::{send, setpoint};
+pub use plan::plan;
+pub use reconstruct::reconstruct;
+pub use run::{check, run};
+pub use study::study;
+pub use world::world;

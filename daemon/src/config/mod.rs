@@ -1,7 +1,9 @@
 //! graspd.toml: serde mirrors in `raw`, checked values in `settings`; nothing downstream validates again.
 
+mod cycle;
 mod raw;
 mod settings;
 
+pub use cycle::{cycle_config, load_kinematics};
 pub use raw::{RawArm, RawConfig, RawConverged, RawFiles, RawLimits, RawLoop, RawServo, RawShm, RawVision};
 pub use settings::{Config, Kinematics, LinkKind, names};

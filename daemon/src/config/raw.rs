@@ -154,11 +154,11 @@ impl Default for RawServo {
     fn default() -> Self {
         Self {
             views: "stereo".into(),
-            jacobian: "current".into(),
-            gain: 2.0,
-            gain_near: 4.0,
-            path_speed_m_s: 0.10,
-            path_speed_rad_s: 0.5,
+            jacobian: "mean".into(),
+            gain: 1.0,
+            gain_near: 2.5,
+            path_speed_m_s: 0.15,
+            path_speed_rad_s: 0.35,
         }
     }
 }
@@ -167,7 +167,7 @@ impl Default for RawServo {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RawConverged {
-    /// Root mean square image error, px, above what the calibration cannot bring to zero.
+    /// Largest root mean square image error with which a goal may count as reached, px: guards against a plan of another rig.
     pub error_px: f64,
     /// Distance to the goal by the tracked marks, m.
     pub distance_m: f64,
@@ -175,13 +175,11 @@ pub struct RawConverged {
     pub angle_rad: f64,
     /// Consecutive stereo pairs for which it must hold.
     pub frames: u32,
-    /// Stop at the pre-grasp pose instead of going on to the grasp.
-    pub pregrasp_only: bool,
 }
 
 impl Default for RawConverged {
     fn default() -> Self {
-        Self { error_px: 0.5, distance_m: 0.000_4, angle_rad: 0.003, frames: 20, pregrasp_only: false }
+        Self { error_px: 12.0, distance_m: 0.000_3, angle_rad: 0.002, frames: 12 }
     }
 }
 
@@ -191,12 +189,10 @@ impl Default for RawConverged {
 pub struct RawLimits {
     /// Joint speed, rad/s, one value for all joints.
     pub joint_speed_rad_s: f64,
-    /// Joint acceleration, rad/s².
+    /// Joint acceleration, and the deceleration of every stop, rad/s².
     pub joint_accel_rad_s2: f64,
     /// Joint jerk, rad/s³.
     pub joint_jerk_rad_s3: f64,
-    /// Deceleration of a stop, rad/s².
-    pub stop_accel_rad_s2: f64,
     /// Speed of the gripper's origin, m/s.
     pub tcp_speed_m_s: f64,
     /// Distance kept from the arm's joint position limits, rad.
@@ -208,8 +204,7 @@ impl Default for RawLimits {
         Self {
             joint_speed_rad_s: 0.5,
             joint_accel_rad_s2: 4.0,
-            joint_jerk_rad_s3: 80.0,
-            stop_accel_rad_s2: 4.0,
+            joint_jerk_rad_s3: 800.0,
             tcp_speed_m_s: 0.25,
             joint_margin_rad: 0.1,
         }

@@ -4,7 +4,7 @@
 ///
 /// # Errors
 /// The operating system's refusal, most often EPERM where RLIMIT_RTPRIO is 0.
-pub fn set_fifo(priority: u8) -> std::io::Result<()> {
+pub(super) fn set_fifo(priority: u8) -> std::io::Result<()> {
     let param = libc::sched_param { sched_priority: i32::from(priority) };
     // SAFETY: pid 0 names the calling thread, and `param` is a live, initialised sched_param for the length of the call,
     // which the kernel only reads.

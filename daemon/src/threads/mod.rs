@@ -1,7 +1,29 @@
 //! The daemon's threads, and the slots between them.
+//!
+//! ```text
+//!  camera ─► shm ─► vision (FIFO, lower) ──Slot<Vision>──► command (FIFO, higher) ─► robot
+//!               └─► acquire (ordinary) ──Slot<Seed>──┘ ▲        │        ▲
+//!                                                joints└────────┘        │ requests, set-point, stop latch
+//!                    telemetry (ordinary) ◄──ring of BeatRecord──┘       │
+//!                    service (ordinary): verbs, signals, supervision ────┘   link manager (ordinary): connect, hand over, reconnect
+//! ```
 
+mod acquire;
+mod command;
+mod report;
+mod service;
+mod shared;
 mod slot;
+mod telemetry;
 mod timing;
+mod vision;
 
+pub use acquire::{AcquireReport, run as run_acquire};
+pub use command::CommandWorker;
+pub use report::Report;
+pub use service::Service;
+pub use shared::{JointSample, Seed, Shared, VisionCounters};
 pub use slot::Slot;
+pub use telemetry::{BeatRecord, fault_number, run as run_telemetry, why_words};
 pub use timing::Latency;
+pub use vision::{VisionWorker, policy};

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 /// A running part of the demo. Dropping it ends the process: first asked, then killed.
 #[derive(Debug)]
-pub struct Part {
+pub(super) struct Part {
     name: &'static str,
     child: Child,
     stdin: Option<ChildStdin>,
@@ -23,7 +23,7 @@ impl Part {
     ///
     /// # Errors
     /// When the program or its log cannot be opened.
-    pub fn start(name: &'static str, args: &[String], folder: &Path) -> Result<Self, Failure> {
+    pub(super) fn start(name: &'static str, args: &[String], folder: &Path) -> Result<Self, Failure> {
         let program = std::env::current_exe().map_err(|e| {
             Failure::link(format!("this program's own path is unknown ({e}); start graspd by its full path"))
         })?;
@@ -53,16 +53,11 @@ impl Part {
         Ok(Self { name, child, stdin, lines })
     }
 
-    /// Its process id.
-    pub fn id(&self) -> u32 {
-        self.child.id()
-    }
-
     /// The next line of its standard output that is a JSON object.
     ///
     /// # Errors
     /// When the part ended, or said nothing for `timeout`.
-    pub fn json_line(&mut self, timeout: Duration) -> Result<serde_json::Value, Failure> {
+    pub(super) fn json_line(&mut self, timeout: Duration) -> Result<serde_json::Value, Failure> {
         let until = Instant::now() + timeout;
         loop {
             let left = until.saturating_duration_since(Instant::now());
@@ -91,7 +86,7 @@ impl Part {
     ///
     /// # Errors
     /// As [`Part::json_line`], and when the pipe is broken.
-    pub fn ask(&mut self, line: &str, timeout: Duration) -> Result<serde_json::Value, Failure> {
+    pub(super) fn ask(&mut self, line: &str, timeout: Duration) -> Result<serde_json::Value, Failure> {
         while self.lines.try_recv().is_ok() {}
         let pipe = self.stdin.as_mut().ok_or_else(|| Failure::link(format!("{} takes no questions", self.name)))?;
         writeln!(pipe, "{line}")
@@ -101,12 +96,12 @@ impl Part {
     }
 
     /// Whether it ended, and how.
-    pub fn ended(&mut self) -> Option<ExitStatus> {
+    pub(super) fn ended(&mut self) -> Option<ExitStatus> {
         self.child.try_wait().ok().flatten()
     }
 
     /// Asks it to end and waits; kills it when it does not. Its exit status, if it had one.
-    pub fn end(&mut self, patience: Duration) -> Option<ExitStatus> {
+    pub(super) fn end(&mut self, patience: Duration) -> Option<ExitStatus> {
         if let Some(status) = self.ended() {
             return Some(status);
         }

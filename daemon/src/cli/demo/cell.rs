@@ -1,0 +1,145 @@
+//! The simulated cell: a world on disk, and three processes in it.
+
+use super::process::Part;
+use crate::cli::DemoArgs;
+use crate::exit::{Exit, Failure};
+use graspd_hil::scenario::{Options, Scenario};
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// How long a part may take to be ready: the scene renders its fixed layers first.
+const READY: Duration = Duration::from_secs(40);
+
+/// A world and its processes. Dropping it ends them: the daemon first, so that the arm is ramped down by its own hand.
+#[derive(Debug)]
+pub(super) struct Cell {
+    /// `graspd run`.
+    pub daemon: Part,
+    /// `graspd-scene`.
+    pub scene: Part,
+    /// `graspd-mock-ur`.
+    pub mock: Part,
+    /// The daemon's configuration.
+    pub config: PathBuf,
+    /// The world's folder.
+    pub world: PathBuf,
+    /// What was drawn.
+    pub scenario: Scenario,
+}
+
+fn two(text: &str, key: &str) -> Result<[f64; 2], Failure> {
+    let usage = || Failure {
+        exit: Exit::Usage,
+        message: format!("{key} {text}: give two numbers joined by a comma, like 0.5,0.1"),
+    };
+    let (a, b) = text.split_once(',').ok_or_else(usage)?;
+    let number = |s: &str| s.trim().parse::<f64>().ok().filter(|v| v.is_finite()).ok_or_else(usage);
+    Ok([number(a)?, number(b)?])
+}
+
+/// What the world is drawn with.
+pub(super) fn options(args: &DemoArgs) -> Result<Options, Failure> {
+    let mut o = Options::default();
+    if let Some(text) = &args.kinematics_error {
+        [o.kinematics_error_mm, o.kinematics_error_deg] = two(text, "--kinematics-error")?;
+    }
+    if let Some(text) = &args.rig_error {
+        let [percent, deg] = two(text, "--rig-error")?;
+        o.focal_error = percent / 100.0;
+        o.rotation_error_deg = deg;
+    }
+    Ok(o)
+}
+
+/// A port offset at which the controller's four services and its real-time port are free on the loopback address.
+fn free_offset(seed: u64) -> Result<u16, Failure> {
+    let start = (std::process::id() as u64).wrapping_mul(131).wrapping_add(seed.wrapping_mul(17));
+    for k in 0..200_u64 {
+        let offset = 1000 + ((start + k * 37) % 30_000) as u16;
+        let free = [29_999_u16, 30_001, 30_002, 30_003, 30_004]
+            .iter()
+            .all(|p| p.checked_add(offset).is_some_and(|p| TcpListener::bind(("127.0.0.1", p)).is_ok()));
+        if free {
+            return Ok(offset);
+        }
+    }
+    Err(Failure::link("no five free ports for the mock controller on 127.0.0.1"))
+}
+
+impl Cell {
+    /// Draws the world, starts mock controller, scene and daemon, and waits until each says that it is ready.
+    ///
+    /// # Errors
+    /// A world that cannot be drawn or written, or a part that does not come up.
+    pub(super) fn start(args: &DemoArgs, folder: &Path) -> Result<Self, Failure> {
+        let world = folder.join("world");
+        let scenario = Scenario::from_seed(args.seed, &options(args)?)
+            .map_err(|e| Failure::input(format!("no world can be drawn from seed {}: {e}", args.seed)))?;
+        scenario.save(&world).map_err(|e| Failure::input(e.to_string()))?;
+        let offset = free_offset(args.seed)?;
+        let cell = format!("demo-{}", std::process::id());
+        let shm = folder.join("shm");
+        let s = |p: &Path| p.display().to_string();
+        let joints = scenario.start.map(|q| format!("{q:.9}")).join(",");
+        let mock_args: Vec<String> = [
+            "mock-ur",
+            "--model",
+            scenario.model.name(),
+            "--bind",
+            "127.0.0.1",
+            "--port-offset",
+            &offset.to_string(),
+            &format!("--start-joints={joints}"),
+            "--kinematics",
+            &s(&world.join("true_arm.toml")),
+            "--record",
+            &s(&folder.join("wire.jsonl")),
+            "--exit-with-stdin",
+        ]
+        .map(str::to_owned)
+        .to_vec();
+        let mut mock = Part::start("mock-ur", &mock_args, folder)?;
+        mock.json_line(READY)?;
+        let scene_args: Vec<String> = [
+            "scene",
+            "--world",
+            &s(&world),
+            "--rtde",
+            &format!("127.0.0.1:{}", 30_004 + offset),
+            "--rate",
+            "60",
+            "--shm-root",
+            &s(&shm),
+            "--cell",
+            &cell,
+        ]
+        .map(str::to_owned)
+        .to_vec();
+        let mut scene = Part::start("scene", &scene_args, folder)?;
+        scene.json_line(READY)?;
+        let config = folder.join("graspd.toml");
+        std::fs::write(&config, config_text(args, &cell, offset, scenario.model.name())).map_err(|e| {
+            Failure::input(format!("{}: cannot be written ({e}); choose another folder with --out", config.display()))
+        })?;
+        let mut daemon = Part::start("graspd", &["run".to_owned(), "--config".to_owned(), s(&config)], folder)?;
+        daemon.json_line(READY)?;
+        Ok(Self { daemon, scene, mock, config, world, scenario })
+    }
+
+    /// Names the part that ended although nobody asked it to.
+    pub(super) fn dead_part(&mut self) -> Option<String> {
+        [("the daemon", &mut self.daemon), ("the scene", &mut self.scene), ("the mock controller", &mut self.mock)]
+            .into_iter()
+            .find_map(|(name, part)| part.ended().map(|status| format!("{name} ended ({status})")))
+    }
+}
+
+fn config_text(args: &DemoArgs, cell: &str, offset: u16, model: &str) -> String {
+    format!(
+        "# Written by graspd demo.\ncell = \"{cell}\"\n\n[files]\nrig = \"world/rig.toml\"\ngripper = \"world/gripper.toml\"\n\n\
+         [shm]\nroot = \"shm\"\n\n[arm]\nlink = \"rtde\"\naddress = \"127.0.0.1\"\nport_offset = {offset}\nmodel = \"{model}\"\n\
+         kinematics = \"world/arm.toml\"\n\n[servo]\nviews = \"{}\"\n",
+        args.views
+    )
+}

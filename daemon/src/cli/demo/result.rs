@@ -1,0 +1,141 @@
+//! What came of the demo: the scene's word on the error, the mock's word on the limits, the daemon's on its timing.
+
+use super::cell::Cell;
+use super::watch::{CONVERGED, Outcome};
+use crate::cli::DemoArgs;
+use crate::exit::Failure;
+use graspd_shm::control::Percentiles;
+use serde_json::{Value, json};
+use std::path::Path;
+use std::time::Duration;
+
+/// The result, as printed.
+#[derive(Clone, Debug)]
+pub(super) struct DemoResult {
+    /// Seed of the world.
+    pub seed: u64,
+    /// Whether the daemon said that it converged.
+    pub converged: bool,
+    /// True distance of the gripper from where it should be, by the scene.
+    pub position_error_mm: f64,
+    /// True angle between the gripper's approach and the valve's axis, by the scene.
+    pub orientation_error_deg: f64,
+    /// From the start of servoing to convergence.
+    pub convergence_s: Option<f64>,
+    /// Beats of the command thread, and those that came a whole period late.
+    pub beats: (u64, u64),
+    /// Pairs tracked.
+    pub frames: u64,
+    /// Set-points on the wire that broke a limit, by the mock controller; `None` when it could not say.
+    pub limit_violations: Option<u64>,
+    /// Wake-up, computing, frame to command, round trip.
+    pub timing: [Percentiles; 4],
+    /// Residual of the marks at rest: the calibration's health.
+    pub residual_px: f64,
+    /// State and cause at the end.
+    pub state: String,
+}
+
+/// Asks the scene for the truth and the daemon's telemetry for the rest.
+///
+/// # Errors
+/// When the scene does not answer.
+pub(super) fn collect(args: &DemoArgs, cell: &mut Cell, outcome: &Outcome) -> Result<DemoResult, Failure> {
+    let s = &outcome.last;
+    let truth = cell.scene.ask(r#"{"ask":"truth"}"#, Duration::from_secs(3))?;
+    let number = |key: &str| truth.pointer(key).and_then(Value::as_f64);
+    let (position, orientation) = (number("/grasp/position_error_mm"), number("/grasp/orientation_error_deg"));
+    let (Some(position_error_mm), Some(orientation_error_deg)) = (position, orientation) else {
+        return Err(Failure::link(format!("the scene does not say how far the gripper is: {truth}")));
+    };
+    Ok(DemoResult {
+        seed: args.seed,
+        converged: s.state == CONVERGED && outcome.seconds.is_some(),
+        position_error_mm,
+        orientation_error_deg,
+        convergence_s: outcome.seconds.filter(|_| s.state == CONVERGED),
+        beats: (s.ticks, s.overruns),
+        frames: s.frames,
+        limit_violations: None,
+        timing: [s.wakeup_us, s.compute_us, s.frame_to_command_us, s.round_trip_us],
+        residual_px: s.residual_px,
+        state: format!(
+            "{}{}",
+            super::watch::STATES.get(s.state as usize).unwrap_or(&"?"),
+            match s.cause_text() {
+                "" => String::new(),
+                cause => format!(" ({cause})"),
+            }
+        ),
+    })
+}
+
+/// Ends the parts in order and takes the mock controller's summary of the wire.
+pub(super) fn close(mut result: DemoResult, cell: &mut Cell, _folder: &Path) -> DemoResult {
+    let patience = Duration::from_secs(3);
+    cell.daemon.end(patience);
+    cell.scene.end(patience);
+    let summary = cell.mock.ask(r#"{"ask":"summary"}"#, patience).ok();
+    result.limit_violations = summary.as_ref().and_then(|v| v.pointer("/limit_violations")).and_then(Value::as_u64);
+    cell.mock.end(patience);
+    result
+}
+
+fn percentiles(p: &Percentiles) -> Value {
+    json!({ "p50": p.p50, "p99": p.p99, "p999": p.p999, "max": p.max })
+}
+
+impl DemoResult {
+    /// One JSON object.
+    pub(super) fn json(&self) -> String {
+        json!({
+            "seed": self.seed,
+            "converged": self.converged,
+            "position_error_mm": self.position_error_mm,
+            "orientation_error_deg": self.orientation_error_deg,
+            "convergence_s": self.convergence_s,
+            "ticks": self.beats.0,
+            "overruns": self.beats.1,
+            "frames": self.frames,
+            "limit_violations": self.limit_violations,
+            "residual_px": if self.residual_px.is_finite() { Some(self.residual_px) } else { None },
+            "state": self.state,
+            "wakeup_us": percentiles(&self.timing[0]),
+            "compute_us": percentiles(&self.timing[1]),
+            "frame_to_command_us": percentiles(&self.timing[2]),
+            "round_trip_us": percentiles(&self.timing[3]),
+        })
+        .to_string()
+    }
+
+    /// A table for people.
+    pub(super) fn table(&self) -> String {
+        use std::fmt::Write;
+        let mut out = String::new();
+        let verdict = if self.converged { "converged" } else { "NOT converged" };
+        let seconds = self.convergence_s.map_or_else(|| "-".into(), |s| format!("{s:.1} s"));
+        let violations = self.limit_violations.map_or_else(|| "unknown".into(), |n| n.to_string());
+        // Writing to a String cannot fail.
+        let _ = writeln!(out, "\n{verdict} in {seconds}; {}", self.state);
+        let _ = writeln!(
+            out,
+            "true error   {:8.3} mm   {:8.3} degrees   (the scene's word)",
+            self.position_error_mm, self.orientation_error_deg
+        );
+        let _ = writeln!(
+            out,
+            "at rest      {:8.3} px   residual of the marks: health of the calibration",
+            self.residual_px
+        );
+        let _ = writeln!(
+            out,
+            "on the wire  {violations} limit violations; {} beats, {} overruns, {} stereo pairs",
+            self.beats.0, self.beats.1, self.frames
+        );
+        let _ = writeln!(out, "\nus                    p50       p99     p99.9       max");
+        for (name, p) in ["wake-up", "compute", "frame to command", "round trip"].iter().zip(&self.timing) {
+            let _ = writeln!(out, "{name:16} {:8.0}  {:8.0}  {:8.0}  {:8.0}", p.p50, p.p99, p.p999, p.max);
+        }
+        out
+    }
+}

@@ -1,0 +1,100 @@
+//! The acquisition thread: finds the marks from scratch whenever the vision thread has lost them. An ordinary thread: it searches
+//! whole pictures, which may take tens of milliseconds.
+
+use super::shared::{Seed, Shared};
+use super::vision::policy;
+use crate::config::Config;
+use crate::realtime::now_ns;
+use graspd_rt::image::ImageView;
+use graspd_rt::online::acquire::{AcquireFailure, AcquireScratch, AcquireSettings, acquire};
+use graspd_shm::frame::FrameSubscriber;
+use graspd_shm::{ShmError, ShmNode};
+use std::sync::Mutex;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+/// Why the marks are not found, in words, for the status verb. Written and read by ordinary threads only.
+#[derive(Debug, Default)]
+pub struct AcquireReport {
+    text: Mutex<String>,
+}
+
+impl AcquireReport {
+    fn set(&self, text: String) {
+        // A poisoned lock still holds a string; whoever panicked was reporting, not deciding.
+        *self.text.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = text;
+    }
+
+    /// The last failure in words, empty after a success.
+    pub fn text(&self) -> String {
+        self.text.lock().unwrap_or_else(std::sync::PoisonError::into_inner).clone()
+    }
+}
+
+fn words(failure: &AcquireFailure) -> String {
+    match failure {
+        AcquireFailure::Size(view) => format!("the {view:?} picture has not the size of the rig's camera"),
+        AcquireFailure::TooFewBlobs { found } => format!(
+            "too few round marks in sight ({} left, {} right): marks hidden, out of focus, too dark or too small",
+            found[0], found[1]
+        ),
+        AcquireFailure::TooFewPairs { found } => format!(
+            "only {found} marks agree between the views: views swapped, wrong rig calibration, or gripper seen by one camera only"
+        ),
+        AcquireFailure::NoConstellation => {
+            "no four marks stand as in the gripper file: another gripper, or wrong mark positions".into()
+        }
+        AcquireFailure::NotVerified { seen, residual_px } => format!(
+            "a pose was found but does not hold in the pictures ({} and {} marks, residual {residual_px:.1} px)",
+            seen[0], seen[1]
+        ),
+        AcquireFailure::Ambiguous { .. } => {
+            "two poses explain the pictures equally well: the mark that tells them apart is hidden, or the layout is symmetric".into()
+        }
+    }
+}
+
+/// Runs until shutdown.
+///
+/// # Errors
+/// When the frame topic cannot be joined.
+pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &AcquireReport) -> Result<(), ShmError> {
+    let mut subscriber = FrameSubscriber::new(node, policy(config))?;
+    let mut scratch = Box::new(AcquireScratch::new());
+    let settings = AcquireSettings::default();
+    let mut converted = [Vec::new(), Vec::new()];
+    while !shared.ending() {
+        std::thread::sleep(Duration::from_millis(20));
+        if !shared.needs_seed.load(Ordering::Acquire) {
+            report.set(String::new());
+            continue;
+        }
+        let received = subscriber.newest(now_ns());
+        let Some(frame) = received.frame else { continue };
+        let (w, h) = (frame.width(), frame.height());
+        for (eye, buffer) in converted.iter_mut().enumerate() {
+            buffer.resize(w * h, 0);
+            if !frame.write_mono8(eye, buffer) {
+                continue;
+            }
+        }
+        let (Some(left), Some(right)) =
+            (ImageView::new(&converted[0], w, h, w), ImageView::new(&converted[1], w, h, w))
+        else {
+            continue;
+        };
+        match acquire(&config.rig.rig, &config.gripper.gripper, &left, &right, &settings, &mut scratch) {
+            Ok(found) => {
+                let [a, b] = frame.capture_ns();
+                shared
+                    .seed
+                    .put(Seed { left_from_gripper: found.left_from_gripper, capture_ns: a.min(b) + a.abs_diff(b) / 2 });
+                report.set(String::new());
+                // Give the vision thread a few frames to take it over before looking again.
+                std::thread::sleep(Duration::from_millis(60));
+            }
+            Err(failure) => report.set(words(&failure)),
+        }
+    }
+    Ok(())
+}

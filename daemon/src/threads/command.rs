@@ -1,0 +1,162 @@
+//! The command thread: a beat of its own, robot state in, one set-point out. It touches no iceoryx2, no lock and no heap.
+
+use super::shared::{JointSample, Shared};
+use super::telemetry::BeatRecord;
+use crate::arm::{ArmLink, LinkPoll};
+use crate::realtime::{Beat, Tick, now_ns};
+use graspd_rt::arm::RobotState;
+use graspd_rt::cycle::{CommandCycle, CommandInput, LinkStatus};
+use graspd_rt::online::Vision;
+use std::sync::atomic::Ordering;
+
+/// Commands whose sending time is kept, to measure the round trip by the echoed beat.
+const SENT: usize = 256;
+
+/// The command thread's state.
+pub struct CommandWorker<'a> {
+    shared: &'a Shared,
+    cycle: CommandCycle,
+    link: Option<Box<dyn ArmLink>>,
+    status: LinkStatus,
+    robot: Option<RobotState>,
+    /// The capture time of the newest pair that no command has answered yet.
+    unanswered: Option<u64>,
+    sent_ns: [(i32, u64); SENT],
+    echo: i32,
+}
+
+impl std::fmt::Debug for CommandWorker<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("CommandWorker").field("status", &self.status).finish_non_exhaustive()
+    }
+}
+
+impl<'a> CommandWorker<'a> {
+    /// A worker without a link; the link manager hands it one.
+    pub fn new(cycle: CommandCycle, shared: &'a Shared) -> Self {
+        Self {
+            shared,
+            cycle,
+            link: None,
+            status: LinkStatus::default(),
+            robot: None,
+            unanswered: None,
+            sent_ns: [(0, 0); SENT],
+            echo: 0,
+        }
+    }
+
+    /// Runs until shutdown.
+    pub fn run(&mut self, period_ns: u64, spin_ns: u64) {
+        let mut beat = Beat::new(period_ns, spin_ns);
+        while !self.shared.ending() {
+            let tick = beat.wait();
+            self.beat(&tick);
+            self.shared.command_beat.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// One beat.
+    pub fn beat(&mut self, tick: &Tick) {
+        if self.link.is_none()
+            && let Some(link) = self.shared.link_ready.take()
+        {
+            self.status = LinkStatus { connected: true, token: link.token(), blocked_sends: 0 };
+            self.link = Some(link);
+        }
+        if self.shared.drop_link.swap(false, Ordering::AcqRel) {
+            self.drop_link();
+        }
+        let now = now_ns();
+        let state = self.poll(now);
+        let mut round_trip_ns = None;
+        if let Some(s) = &state {
+            // A full queue means a vision thread that does not read; its own age checks speak for that.
+            let _ = self.shared.joints.push(JointSample { at_ns: s.received_ns, q: s.q });
+            if s.echo != self.echo {
+                self.echo = s.echo;
+                let (beat, at) = self.sent_ns[s.echo.rem_euclid(SENT as i32) as usize];
+                round_trip_ns = (beat == s.echo && at > 0).then(|| s.received_ns.saturating_sub(at));
+            }
+            self.robot = Some(*s);
+        }
+        let vision = self.shared.vision.take();
+        if let Some(v) = &vision {
+            self.unanswered = Some(middle(v));
+        }
+        let setpoint = self.shared.setpoint.take();
+        let request = if self.shared.stop_latch.swap(false, Ordering::AcqRel) {
+            Some(graspd_rt::cycle::Request { id: 0, kind: graspd_rt::cycle::RequestKind::Stop })
+        } else {
+            self.shared.requests.pop()
+        };
+        let out = self.cycle.step(&CommandInput {
+            now_ns: now,
+            robot: state,
+            link: self.status,
+            vision: vision.as_ref(),
+            request,
+            setpoint: setpoint.as_ref(),
+            internal_fault: self.shared.broken.load(Ordering::Acquire),
+        });
+        self.send(&out.command);
+        let done = now_ns();
+        if let Some(reply) = out.reply {
+            let _ = self.shared.replies.force_push(reply);
+        }
+        if let Some(reply) = out.setpoint_reply {
+            self.shared.setpoint_reply.put(reply);
+        }
+        let note = BeatRecord {
+            record: out.record,
+            event: out.event,
+            wakeup_ns: tick.lateness_ns(),
+            compute_ns: done.saturating_sub(tick.woke_ns),
+            skipped: tick.skipped,
+            frame_to_command_ns: self.unanswered.take().map(|at| done.saturating_sub(at)),
+            round_trip_ns,
+            link: if self.link.is_some() { 2 } else { 1 },
+            robot: self.robot.map_or((-1, 0), |r| (r.robot_mode, r.safety_status_bits)),
+        };
+        // A full ring means a telemetry thread that does not read: the oldest notes go, the loop does not wait.
+        let _ = self.shared.records.force_push(note);
+    }
+
+    fn poll(&mut self, now: u64) -> Option<RobotState> {
+        let link = self.link.as_mut()?;
+        match link.poll(now) {
+            LinkPoll { fault: None, state, .. } => state,
+            LinkPoll { .. } => {
+                self.drop_link();
+                None
+            }
+        }
+    }
+
+    fn send(&mut self, command: &graspd_rt::arm::ArmCommand) {
+        let Some(link) = self.link.as_mut() else { return };
+        let dropped = link.stats().dropped;
+        match link.send(command) {
+            Ok(()) if link.stats().dropped == dropped => {
+                self.status.blocked_sends = 0;
+                self.sent_ns[command.beat.rem_euclid(SENT as i32) as usize] = (command.beat, now_ns());
+            }
+            Ok(()) => self.status.blocked_sends = self.status.blocked_sends.saturating_add(1),
+            Err(_) => self.drop_link(),
+        }
+    }
+
+    /// Hands a dead link to the manager, which closes it and makes another one: both take time that this thread has not.
+    fn drop_link(&mut self) {
+        if let Some(link) = self.link.take() {
+            self.shared.link_dead.put(link);
+        }
+        self.status = LinkStatus::default();
+        self.robot = None;
+    }
+}
+
+fn middle(v: &Vision) -> u64 {
+    let [a, b] = v.capture_ns;
+    a.min(b) + a.abs_diff(b) / 2
+}

@@ -1,0 +1,231 @@
+//! The telemetry thread: drains what the loop noted, keeps latency histograms, publishes 50 samples a second, logs changes of mode.
+//! An ordinary thread: formatting, histograms and iceoryx2's send stay off the loop.
+
+use super::report::Report;
+use super::shared::Shared;
+use super::timing::Latency;
+use crate::config::Config;
+use graspd_rt::cycle::{CycleRecord, Stage, Transition, Why};
+use graspd_rt::gripper::MAX_MARKS;
+use graspd_rt::mode::ModeName;
+use graspd_rt::online::Vision;
+use graspd_rt::setpoint::{Goal, SetPoint};
+use graspd_shm::ShmNode;
+use graspd_shm::control::{ControlError, TelemetryPublisher, TelemetrySample};
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+/// What the command thread notes about one beat.
+#[derive(Clone, Copy, Debug)]
+pub struct BeatRecord {
+    /// What the cycle knew and did.
+    pub record: CycleRecord,
+    /// A change of mode.
+    pub event: Option<Transition>,
+    /// How late the thread woke, ns.
+    pub wakeup_ns: u64,
+    /// From waking to the command sent, ns.
+    pub compute_ns: u64,
+    /// Whole periods missed before this beat.
+    pub skipped: u64,
+    /// From the exposure of a pair to this command, in the first beat that used the pair.
+    pub frame_to_command_ns: Option<u64>,
+    /// From a command to its echo, when a new echo came.
+    pub round_trip_ns: Option<u64>,
+    /// 0 down, 1 connecting, 2 up.
+    pub link: u32,
+    /// The controller's robot mode and safety bits.
+    pub robot: (i32, u32),
+}
+
+/// A stable number for a stable code like "F-ARM-05": its group times a hundred and its own number.
+pub fn fault_number(code: &str) -> u32 {
+    let mut parts = code.split('-').skip(1);
+    let group = match parts.next() {
+        Some("CAM") => 1,
+        Some("MRK") => 2,
+        Some("LAW") => 3,
+        Some("ARM") => 4,
+        Some("TIM") => 5,
+        _ => 9,
+    };
+    group * 100 + parts.next().and_then(|n| n.parse().ok()).unwrap_or(0)
+}
+
+/// Why a mode changed, in words with its code where it has one.
+pub fn why_words(why: &Why) -> String {
+    match why {
+        Why::Readiness => "readiness of marks and robot changed".into(),
+        Why::Request(kind) => format!("asked for: {kind:?}"),
+        Why::Progress => "progress of the motion".into(),
+        Why::AtRest => "at rest".into(),
+        Why::Hold(cause) => format!("{}: {cause}", cause.code()),
+        Why::Fault(cause) => format!("{}: {cause}", cause.code()),
+    }
+}
+
+#[derive(Debug, Default)]
+struct Latencies {
+    wakeup: Latency,
+    compute: Latency,
+    frame: Latency,
+    round_trip: Latency,
+}
+
+/// Runs until shutdown.
+///
+/// # Errors
+/// When the telemetry topic cannot be opened.
+pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &Report) -> Result<(), ControlError> {
+    let publisher = TelemetryPublisher::new(node)?;
+    let mut latencies = Latencies::default();
+    let mut sample = TelemetrySample { mark_count: config.gripper.gripper.marks.len() as u32, ..Default::default() };
+    sample.views = match config.raw.servo.views.as_str() {
+        "left" => 1,
+        "right" => 2,
+        "best" => 3,
+        _ => 0,
+    };
+    let mut setpoint: Option<SetPoint> = None;
+    let mut settled = false;
+    loop {
+        let ending = shared.ending();
+        let mut last = None;
+        while let Some(beat) = shared.records.pop() {
+            // Percentiles are of the loop in service: from the first arming on, and afresh with each.
+            if beat.event.is_some_and(|e| e.to == ModeName::Servoing && e.from == ModeName::Armed) {
+                latencies = Latencies::default();
+                settled = true;
+            }
+            note(&mut latencies, &beat);
+            if let Some(event) = beat.event {
+                let why = why_words(&event.why);
+                eprintln!("graspd: {} -> {}: {why}", event.from.as_str(), event.to.as_str());
+                report.transition(&event, &why);
+                match event.why {
+                    Why::Fault(cause) => {
+                        sample.fault = fault_number(cause.code());
+                        sample.set_cause(&why);
+                    }
+                    Why::Hold(_) => sample.set_cause(&why),
+                    _ if matches!(event.to, ModeName::Tracking | ModeName::Servoing | ModeName::Armed) => {
+                        sample.fault = 0;
+                        sample.set_cause("");
+                    }
+                    _ => {}
+                }
+            }
+            last = Some(beat);
+        }
+        while let Some(next) = report.setpoint_for_telemetry() {
+            setpoint = Some(next);
+        }
+        if let Some(vision) = shared.vision_seen.take() {
+            marks(&mut sample, &vision);
+        }
+        if let Some(beat) = last {
+            fill(&mut sample, &beat, setpoint.as_ref());
+            report.beat(&beat.record);
+        }
+        sample.frames = shared.counters.frames.load(Ordering::Relaxed);
+        sample.frames_skipped = shared.counters.skipped.load(Ordering::Relaxed);
+        sample.frames_refused = shared.counters.refused.load(Ordering::Relaxed);
+        sample.wakeup_us = latencies.wakeup.percentiles();
+        sample.compute_us = latencies.compute.percentiles();
+        sample.frame_to_command_us = latencies.frame.percentiles();
+        sample.round_trip_us = latencies.round_trip.percentiles();
+        sample.sequence += 1;
+        report.sample(&sample, settled);
+        // A full subscriber list or a dying reader must not end the daemon; the next sample follows in 20 ms.
+        let _ = publisher.publish(&sample);
+        if ending {
+            return Ok(());
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+fn note(l: &mut Latencies, beat: &BeatRecord) {
+    l.wakeup.note(beat.wakeup_ns);
+    l.compute.note(beat.compute_ns);
+    if let Some(ns) = beat.frame_to_command_ns {
+        l.frame.note(ns);
+    }
+    if let Some(ns) = beat.round_trip_ns {
+        l.round_trip.note(ns);
+    }
+}
+
+fn fill(sample: &mut TelemetrySample, beat: &BeatRecord, setpoint: Option<&SetPoint>) {
+    let r = &beat.record;
+    sample.stamp_ns = r.now_ns;
+    sample.state = r.mode as u32;
+    sample.phase = match (r.mode, r.stage) {
+        (ModeName::Converged, _) => 3,
+        (ModeName::Servoing, Stage::Pregrasp) => 1,
+        (ModeName::Servoing, Stage::Grasp) => 2,
+        (ModeName::Servoing, Stage::Turn) => 5,
+        (ModeName::Servoing, Stage::Retreat) => 6,
+        _ => 0,
+    };
+    sample.ticks = r.counters.beats;
+    sample.overruns = r.counters.overruns;
+    sample.setpoint = r.setpoint_id;
+    sample.link = beat.link;
+    (sample.robot_mode, sample.safety_bits) = beat.robot;
+    sample.limits_active = u32::from(r.held.0);
+    sample.q = r.q;
+    sample.qd = r.qd;
+    sample.command = r.command.rates;
+    sample.screw = r.screw.into();
+    let p = &r.left_from_gripper;
+    let q = p.rotation.quaternion();
+    let t = p.translation.vector;
+    sample.left_from_gripper = [t.x, t.y, t.z, q.w, q.i, q.j, q.k];
+    sample.error_px = r.error_px;
+    sample.residual_px = r.residual_px;
+    sample.condition = r.mark_condition;
+    sample.gain = r.scale;
+    let goal = setpoint.filter(|s| s.id == r.setpoint_id).map(|s| match r.stage {
+        Stage::Pregrasp | Stage::Retreat => &s.pregrasp,
+        Stage::Grasp | Stage::Turn => &s.grasp,
+    });
+    (sample.distance_m, sample.angle_rad) = match goal {
+        Some(g) => {
+            let d = p.inverse() * g.left_from_gripper;
+            (d.translation.vector.norm(), d.rotation.angle())
+        }
+        None => (f64::NAN, f64::NAN),
+    };
+    goals(sample, goal);
+}
+
+fn marks(sample: &mut TelemetrySample, vision: &Vision) {
+    sample.marks_seen = vision.seen.map(u32::from);
+    for (eye, seen) in vision.marks.iter().enumerate() {
+        for (i, mark) in seen.iter().enumerate().take(MAX_MARKS) {
+            sample.marks[eye][i] = mark.map_or([f32::NAN; 2], |m| [m.pixel.x as f32, m.pixel.y as f32]);
+        }
+    }
+}
+
+fn goals(sample: &mut TelemetrySample, goal: Option<&Goal>) {
+    for eye in 0..2 {
+        for i in 0..MAX_MARKS {
+            let pixel = goal.and_then(|g| g.marks[eye][i]);
+            sample.goals[eye][i] = pixel.map_or([f32::NAN; 2], |p| [p.x as f32, p.y as f32]);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::fault_number;
+
+    #[test]
+    fn codes_have_stable_numbers() {
+        assert_eq!(fault_number("F-ARM-05"), 405);
+        assert_eq!(fault_number("F-CAM-01"), 101);
+        assert_eq!(fault_number("F-INT-01"), 901);
+    }
+}

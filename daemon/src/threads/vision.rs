@@ -1,0 +1,138 @@
+//! The vision thread: newest pair, track, gripper pose. It owns the frame subscriber, and nothing it does can delay the arm's beat.
+
+use super::shared::{Seed, Shared};
+use crate::config::Config;
+use crate::realtime::{Beat, now_ns};
+use graspd_rt::arm::Dh;
+use graspd_rt::geom::Pose;
+use graspd_rt::image::ImageView;
+use graspd_rt::online::predict::{JointHistory, left_from_gripper_now};
+use graspd_rt::online::{FrameLimits, StereoFrame, VisionCycle, VisionSettings};
+use graspd_shm::frame::{FramePolicy, FrameSubscriber, SourceEvent};
+use graspd_shm::{ShmError, ShmNode};
+use std::sync::atomic::Ordering;
+
+/// The vision thread's state; made on the thread that runs it.
+#[derive(Debug)]
+pub struct VisionWorker<'a> {
+    shared: &'a Shared,
+    subscriber: FrameSubscriber,
+    cycle: VisionCycle,
+    history: JointHistory,
+    dh: Dh,
+    flange_from_gripper: Pose,
+    /// Pose and capture time of the last good result: what the joints' motion is added to.
+    last: Option<(u64, Pose)>,
+    /// Mono8 copies for formats that are not; empty when the camera sends mono8.
+    converted: [Vec<u8>; 2],
+}
+
+/// What the frame topic has to carry for this rig.
+pub fn policy(config: &Config) -> FramePolicy {
+    let rig = &config.rig.rig;
+    FramePolicy { size: Some((rig.left.width, rig.left.height)), ..FramePolicy::default() }
+}
+
+impl<'a> VisionWorker<'a> {
+    /// Joins the frame topic and allocates everything the loop needs.
+    ///
+    /// # Errors
+    /// When the frame topic cannot be joined.
+    pub fn new(config: &Config, dh: Dh, node: &ShmNode, shared: &'a Shared) -> Result<Self, ShmError> {
+        let subscriber = FrameSubscriber::new(node, policy(config))?;
+        let settings = VisionSettings {
+            frame: FrameLimits { max_skew_ns: (config.raw.vision.max_skew_ms * 1e6) as u64, ..FrameLimits::default() },
+            ..VisionSettings::default()
+        };
+        let gripper = config.gripper.gripper.clone();
+        let flange_from_gripper = gripper.flange_from_gripper;
+        let pixels = |c: &graspd_rt::geom::Camera| vec![0_u8; c.width as usize * c.height as usize];
+        Ok(Self {
+            shared,
+            subscriber,
+            cycle: VisionCycle::new(config.rig.rig, gripper, settings),
+            history: JointHistory::default(),
+            dh,
+            flange_from_gripper,
+            last: None,
+            converted: [pixels(&config.rig.rig.left), pixels(&config.rig.rig.right)],
+        })
+    }
+
+    /// Runs until shutdown.
+    pub fn run(&mut self, poll_ns: u64) {
+        let mut beat = Beat::new(poll_ns, 0);
+        while !self.shared.ending() {
+            beat.wait();
+            self.look();
+            self.shared.vision_beat.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// One look at the frame topic; tracks the newest pair, if there is a new one.
+    pub fn look(&mut self) {
+        while let Some(s) = self.shared.joints.pop() {
+            self.history.push(s.at_ns, &s.q);
+        }
+        let now = now_ns();
+        let Self { subscriber, cycle, history, dh, flange_from_gripper, last, converted, shared } = self;
+        let received = subscriber.newest(now);
+        let counters = &shared.counters;
+        counters.skipped.fetch_add(received.skipped, Ordering::Relaxed);
+        counters.refused.fetch_add(u64::from(received.rejected), Ordering::Relaxed);
+        if matches!(received.source, Some(SourceEvent::First | SourceEvent::TakenOver)) {
+            cycle.reset();
+            *last = None;
+        }
+        let Some(frame) = received.frame else {
+            shared.needs_seed.store(cycle.needs_acquisition(), Ordering::Release);
+            return;
+        };
+        let (w, h, stride) = (frame.width(), frame.height(), frame.stride());
+        let mut view = |eye: usize| -> Option<(usize, bool)> {
+            if frame.mono8(eye).is_some() {
+                return Some((stride, true));
+            }
+            let ok = frame.write_mono8(eye, &mut converted[eye]);
+            ok.then_some((w, false))
+        };
+        let (Some(l), Some(r)) = (view(0), view(1)) else {
+            counters.refused.fetch_add(1, Ordering::Relaxed);
+            return;
+        };
+        let bytes =
+            |eye: usize, direct: bool| if direct { frame.mono8(eye).unwrap_or(&[]) } else { &converted[eye][..] };
+        let pictures = (ImageView::new(bytes(0, l.1), w, h, l.0), ImageView::new(bytes(1, r.1), w, h, r.0));
+        let (Some(left), Some(right)) = pictures else {
+            counters.refused.fetch_add(1, Ordering::Relaxed);
+            return;
+        };
+        let capture = frame.capture_ns();
+        let middle = capture[0].min(capture[1]) + capture[0].abs_diff(capture[1]) / 2;
+        let moved = |at: u64, pose: &Pose| -> Option<Pose> {
+            let (then, now) = (history.at(at)?, history.at(middle)?);
+            Some(left_from_gripper_now(dh, flange_from_gripper, pose, &then, &now))
+        };
+        if let Some(Seed { left_from_gripper, capture_ns }) = shared.seed.take()
+            && cycle.needs_acquisition()
+        {
+            cycle.seed(moved(capture_ns, &left_from_gripper).unwrap_or(left_from_gripper));
+            counters.acquired.fetch_add(1, Ordering::Relaxed);
+        }
+        let prior = last.as_ref().and_then(|(at, pose)| moved(*at, pose));
+        let pair = StereoFrame { left, right, sequence: frame.sequence(), capture_ns: capture, now_ns: now };
+        match cycle.step(&pair, prior) {
+            Ok(vision) => {
+                *last = (vision.status != graspd_rt::online::VisionStatus::Lost)
+                    .then_some((middle, vision.left_from_gripper));
+                counters.frames.fetch_add(1, Ordering::Relaxed);
+                shared.vision.put(vision);
+                shared.vision_seen.put(vision);
+            }
+            Err(_) => {
+                counters.refused.fetch_add(1, Ordering::Relaxed);
+            }
+        }
+        shared.needs_seed.store(cycle.needs_acquisition(), Ordering::Release);
+    }
+}
