@@ -104,7 +104,10 @@ impl UrLink {
             if let Some(n) = self.session.transmit(&mut out)? {
                 self.stream.write_all(out.get(..n).unwrap_or_default()).map_err(io)?;
             }
-            while let Some(package) = self.framer.next()? {
+            // Data merged behind the answer to S stays in the framer for the first poll.
+            while self.session.phase() != Phase::Running
+                && let Some(package) = self.framer.next()?
+            {
                 if let Event::Text(text) = self.session.handle(package)? {
                     eprintln!("controller says: {text}");
                 }
@@ -139,7 +142,7 @@ impl UrLink {
             let now = crate::realtime::now_ns();
             let poll = self.poll(now);
             if let Some(fault) = poll.fault {
-                return Err(io(io::Error::other(fault.to_string())));
+                return Err(ArmError::Link(fault));
             }
             if poll.packages == 0 {
                 self.wait(now + 20_000_000);

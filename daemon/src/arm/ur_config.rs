@@ -133,6 +133,9 @@ pub enum ArmError {
     /// The stream is not RTDE.
     #[error("RTDE: {0}; is this port really RTDE?")]
     Framing(#[from] graspd_rt::rtde::FrameError),
+    /// The session ended while it was being set up.
+    #[error("RTDE: {0}")]
+    Link(#[from] super::LinkFault),
     /// Another program runs on the robot.
     #[error("another program runs on the robot; stop it on the pendant, or run `graspd recover`")]
     ProgramRunning,
