@@ -62,7 +62,8 @@ pub fn gaps_with_sigma(
     let mut variance = [0.0; 2];
     for view in 0..2 {
         // Steps of a hundredth of a standard deviation keep the difference in the linear range and clear of rounding.
-        let mut slope = [[0.0; 5]; 2];
+        let mut slope = [nalgebra::Vector5::zeros(), nalgebra::Vector5::zeros()];
+        #[allow(clippy::needless_range_loop)] // k names a parameter of the fit, not an entry of one list.
         for k in 0..5 {
             let step = (fits[view].cofactor[(k, k)].sqrt() * noise[view] * 0.01).max(1e-6 * fits[view].ellipse.a);
             let at = |s: f64| {
@@ -76,7 +77,7 @@ pub fn gaps_with_sigma(
             }
         }
         for g in 0..2 {
-            let j = nalgebra::Vector5::from(slope[g]);
+            let j = slope[g];
             variance[g] += j.dot(&(fits[view].cofactor * j)) * noise[view] * noise[view];
         }
     }

@@ -26,7 +26,7 @@ pub fn paper(cones: &ConePair, pencil: &Pencil) -> Result<PlanePair, Refusal> {
     let lambda = pencil.lambda();
     let (w, v) = eigen::symmetric(&(cones.q[0] + cones.q[1] * lambda));
     let (low, high) = (w[0], w[3]);
-    if !(high > 0.0 && low < 0.0) || !lambda.is_finite() {
+    if !(high > 0.0 && low < 0.0 && lambda.is_finite()) {
         return Err(Refusal::NoPlanes { why: "the non-zero eigenvalues have one sign" });
     }
     let (a, b) = (v.column(3) * high.sqrt(), v.column(0) * (-low).sqrt());

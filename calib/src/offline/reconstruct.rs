@@ -108,7 +108,7 @@ fn any_model(
     let noise = bar.noise.min(flat.report.noise).max(1e-6);
     let flat_score = score(flat.model, truncated(&rest, noise), more, rest.len(), noise);
     let bar_score = bar_scored(noise);
-    let scores: Vec<Score> = flat.report.scores.iter().cloned().chain([bar_score.clone()]).collect();
+    let scores: Vec<Score> = flat.report.scores.iter().copied().chain([bar_score]).collect();
     if bar_score.bic < flat_score.bic {
         match bar_result(&bar, scores.clone(), a, points, p, options) {
             Ok(r) => return Ok(r),

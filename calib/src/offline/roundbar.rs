@@ -11,7 +11,7 @@ use super::reconstruct::{base_report, tolerable};
 use super::refusal::Refusal;
 use super::robust::{GATE, median};
 use super::torus::{Free, Ray, Torus, TorusFit, fit, rays};
-use nalgebra::{Matrix2, Vector3};
+use nalgebra::Matrix2;
 
 /// A median absolute deviation times this is a standard deviation for Gaussian noise.
 const MAD: f64 = 1.482_602_218_505_602;
@@ -142,19 +142,20 @@ fn start(
         });
     }
     let has_inner = inside.iter().all(|v| v.len() >= 10);
-    if has_inner && let Ok(a) = analyse([&inside[0], &inside[1]], p, options) {
-        if let Some(hole) = plane_rim(&a) {
-            let small = (hole.a * hole.b).sqrt();
-            let r = bar.unwrap_or(0.5 * (radius - small)).max(0.01 * radius);
-            let torus = Torus {
-                centre: (rim.centre + hole.centre) * 0.5,
-                normal: (rim.normal + hole.normal).normalize(),
-                core: 0.5 * (radius + small),
-                bar: r,
-            };
-            if r < 0.9 * torus.core && torus.normal.iter().all(|x| x.is_finite()) {
-                return Ok((torus, true));
-            }
+    if has_inner
+        && let Ok(a) = analyse([&inside[0], &inside[1]], p, options)
+        && let Some(hole) = plane_rim(&a)
+    {
+        let small = (hole.a * hole.b).sqrt();
+        let r = bar.unwrap_or(0.5 * (radius - small)).max(0.01 * radius);
+        let torus = Torus {
+            centre: (rim.centre + hole.centre) * 0.5,
+            normal: (rim.normal + hole.normal).normalize(),
+            core: 0.5 * (radius + small),
+            bar: r,
+        };
+        if r < 0.9 * torus.core && torus.normal.iter().all(|x| x.is_finite()) {
+            return Ok((torus, true));
         }
     }
     let r = bar.unwrap_or(0.1 * radius);
@@ -218,8 +219,7 @@ pub(crate) fn bar_result(
     let cov_centre = cov.fixed_view::<3, 3>(0, 0).into_owned();
     let cov_normal = cov.fixed_view::<2, 2>(3, 3).into_owned();
     let (sigma_centre, sigma_normal) = (cov_centre.trace().sqrt(), cov_normal.trace().sqrt());
-    let turn: Vector3<f64> = torus.centre;
-    let angle = vergence(&turn, &outer.centres);
+    let angle = vergence(&torus.centre, &outer.centres);
     tolerable(sigma_centre, sigma_normal, torus.core, angle, RimModel::RoundBar, options)
         .map_err(|e| if alone { undetermined(sigma_centre, sigma_normal) } else { e })?;
     // Radii that are confused with each other by more than a tenth of the bar are not an answer even where centre and normal are.
