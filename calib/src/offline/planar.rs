@@ -108,6 +108,7 @@ pub fn analyse(points: [&[EdgePoint]; 2], p: [&Projection; 2], options: &Options
     let centres = check_cameras(p[0], p[1])?;
     let fits = [fit_view(points[0], View::Left, options)?, fit_view(points[1], View::Right, options)?];
     let (noise, known) = pooled_noise(&fits, points, options);
+    judgeable(&fits, points, noise, known, options)?;
     let cones = ConePair::new([&fits[0].fit.conic, &fits[1].fit.conic], p)?;
     let pencil = Pencil::new(&cones.q[0], &cones.q[1]);
     let (gap_px, gap_sigma_px) = gaps_with_sigma(
@@ -161,6 +162,23 @@ fn pooled_noise(fits: &[RobustFit; 2], points: [&[EdgePoint]; 2], options: &Opti
         _ if estimated <= floor => (floor, true),
         _ => (estimated, false),
     }
+}
+
+/// Refuses so few points that their own scatter cannot tell a match from chance: with the noise unknown, ten residuals beyond the
+/// parameters are needed; with sigmas given, the scatter must at least agree with them.
+fn judgeable(
+    fits: &[RobustFit; 2],
+    points: [&[EdgePoint]; 2],
+    noise: f64,
+    known: bool,
+    options: &Options,
+) -> Result<(), Refusal> {
+    let dof = (fits[0].fit.count + fits[1].fit.count).saturating_sub(10);
+    if known || dof >= 10 || (options.noise == Noise::AtLeastGiven && noise <= 3.0) {
+        return Ok(());
+    }
+    let k = usize::from(points[1].len() < points[0].len());
+    Err(Refusal::TooFewPoints { view: View::BOTH[k], count: points[k].len(), needed: 10 })
 }
 
 /// Both maximum-likelihood fits from every closed form there is, the better of the minima, then checked for cameras and face.

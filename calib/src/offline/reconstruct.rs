@@ -65,8 +65,9 @@ fn any_model(
     let inner = points.map(|v| v.iter().filter(|q| q.outline == Outline::Inner).copied().collect::<Vec<_>>());
     let both = inner.iter().all(|v| v.len() >= 10);
     let flat = plane(a, points, p, options);
-    // One outline that a plane rim explains needs no second opinion: a bar would only add a parameter that it cannot determine.
-    if !both && options.bar_diameter.is_none() && flat.is_ok() {
+    // One outline without the bar's diameter: a bar would only add a parameter that it cannot determine, and with it the freedom to
+    // explain two contours that are no pair.
+    if !both && options.bar_diameter.is_none() {
         return flat;
     }
     let bar = match fit_bar(points, p, a, options) {

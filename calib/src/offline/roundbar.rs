@@ -16,6 +16,9 @@ use nalgebra::Matrix2;
 /// A median absolute deviation times this is a standard deviation for Gaussian noise.
 const MAD: f64 = 1.482_602_218_505_602;
 
+/// How far an outline's ellipse may miss its epipolar tangents, pixels (one standard deviation).
+const OUTLINE_PX: f64 = 0.25;
+
 /// The limits of the excess with 5 and 6 degrees of freedom over that with 2, at 4 sigma.
 const MORE_FREEDOM: f64 = 1.5;
 
@@ -73,7 +76,7 @@ pub(crate) fn fit_bar(
         flip(&mut fitted);
     }
     let count = keep.iter().filter(|k| **k).count();
-    if count * 2 < all.len() || count <= 7 {
+    if count * 10 < all.len() * 6 || count <= 7 {
         return Err(Refusal::NoFit { why: "most points do not lie on the outlines of one bar" });
     }
     let dof = count.saturating_sub(fitted.parameters).max(1);
@@ -183,7 +186,13 @@ pub(crate) fn bar_result(
     if px > options.max_noise_px {
         return Err(Refusal::NoFit { why: "the points do not lie on the outlines of one bar" });
     }
-    if bar.excess > bar.limit {
+    // The epipolar planes that touch the bar touch both its outlines, so that the tangency gaps close for a bar as for a plane rim, up
+    // to the difference between an outline and the ellipse fitted to it.
+    let open = (0..2).any(|k| {
+        let allowed = outer.gap_sigma_px[k].hypot(options.calibration_px).hypot(OUTLINE_PX);
+        outer.gap_px[k].abs() > options.gate_sigmas * allowed
+    });
+    if open || bar.excess > bar.limit {
         return Err(Refusal::Mismatch {
             gap_px: outer.gap_px,
             gap_sigma_px: outer.gap_sigma_px,
