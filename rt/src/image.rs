@@ -56,8 +56,8 @@ impl<'a> ImageView<'a> {
         // Rounding down may take a position below its true value by one unit; it must not fall below zero.
         const LEAST: f64 = 2.0 / ONE;
         let n = out.len().saturating_sub(1) as f64;
-        let inside =
-            |x: f64, y: f64| x >= 0.0 && y >= 0.0 && x < (self.width - 1) as f64 && y < (self.height - 1) as f64;
+        let (right, bottom) = ((self.width - 1) as f64, (self.height - 1) as f64);
+        let inside = |x: f64, y: f64| x >= LEAST && y >= LEAST && x < right && y < bottom;
         if !(inside(x, y) && inside(x + n * dx, y + n * dy)) {
             return false;
         }
@@ -107,6 +107,11 @@ mod tests {
             (1.0, 1.0, 0.0, f64::INFINITY),
         ] {
             assert!(!view.profile(x, y, dx, dy, &mut out), "{x} {y} {dx} {dy}");
+        }
+        // Towards the upper left border, in steps that rounding shortens or lengthens: inside or refused, never below zero.
+        for k in 0..4000 {
+            let (x, d) = (4.0 + f64::from(k) * 3.7e-6, -0.5 + f64::from(k % 7) * 1e-6);
+            view.profile(x, x, d, d, &mut out);
         }
         assert!(!view.profile(17.0, 1.0, 0.0, 0.0, &mut out) && !view.profile(1.0, 11.0, 0.0, 0.0, &mut out));
     }
