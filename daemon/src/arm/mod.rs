@@ -13,7 +13,7 @@ mod script;
 mod ur;
 mod ur_config;
 
-pub use backoff::{Connector, backoff_delay};
+pub use backoff::backoff_delay;
 pub use dashboard::Dashboard;
 pub use link::{ArmLink, LinkFault, LinkPoll, LinkStats};
 pub use mock_link::{MockArm, MockLimits};
