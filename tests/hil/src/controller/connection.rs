@@ -3,13 +3,13 @@
 use super::command::Port;
 use super::link_faults::WireFaults;
 use super::rtde_session::{ClientId, RtdeSession};
-use super::script_stream::ScriptStream;
+use crate::urscript::Collector;
 use std::collections::VecDeque;
 use std::io::{ErrorKind, Read, Write};
 use std::net::TcpStream;
 use std::time::Duration;
 
-/// A client that does not read is cut off after this long, as by a real controller.
+/// An RTDE client that does not read is cut off after this long, as by a real controller.
 const CUT_OFF_NS: u64 = 10_000_000_000;
 /// Bytes that may wait for a client, kept-back ones included.
 const MOST_WAITING: usize = 4 << 20;
@@ -21,9 +21,9 @@ pub(super) enum Role {
     /// Lines in, lines out.
     Dashboard(Vec<u8>),
     /// State and messages out; scripts in, unless read-only.
-    State { scripts: Option<ScriptStream> },
+    State { scripts: Option<Collector> },
     /// The real-time package out; scripts in, unless read-only.
-    Realtime { scripts: Option<ScriptStream> },
+    Realtime { scripts: Option<Collector> },
     /// RTDE.
     Rtde(Box<RtdeSession>),
     /// JSON lines.
@@ -130,7 +130,8 @@ impl Connection {
                 Err(e) if e.kind() == ErrorKind::Interrupted => continue,
                 Err(e) if e.kind() == ErrorKind::WouldBlock => {
                     let since = *self.blocked_since.get_or_insert(now_ns);
-                    if now_ns.saturating_sub(since) > CUT_OFF_NS {
+                    // The other ports go on leaving out packages: SDU's client uploads through 30003 and never reads it.
+                    if self.port == Port::Rtde && now_ns.saturating_sub(since) > CUT_OFF_NS {
                         self.over = Some("did not read for 10 s");
                     }
                 }

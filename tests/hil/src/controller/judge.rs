@@ -78,6 +78,14 @@ pub struct Episode {
     pub rest_ns: u64,
 }
 
+impl Episode {
+    /// From the last beat to rest, ns; `None` while the arm moves. After a client died this is the robot's own reaction:
+    /// watchdog and ramp.
+    pub fn stop_ns(&self) -> Option<u64> {
+        (self.rest_ns > 0).then(|| self.rest_ns.saturating_sub(self.last_beat_ns))
+    }
+}
+
 /// What was seen so far.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Summary {

@@ -4,7 +4,7 @@ use super::message::MessageKind;
 use super::robot::{PROGRAM_STOP_DECEL, Robot};
 use super::state::{RobotMode, RuntimeState};
 use crate::plant::Motion;
-use crate::urscript::{Machine, StepOutcome};
+use crate::urscript::{Machine, ProgramKind, StepOutcome};
 
 /// Programs side by side (`sec`); more are refused.
 const MOST_SECONDARY: usize = 8;
@@ -40,11 +40,6 @@ impl Robot {
     /// Takes a script as ports 30001 to 30003 do: `def` replaces the main program, `sec` runs beside it, a bare line is a
     /// program of one line.
     pub fn upload(&mut self, text: &str) -> Upload {
-        let first = text.split_whitespace().next().unwrap_or("");
-        if text.trim() == "stop program" {
-            self.stop_program();
-            return Upload::Main;
-        }
         let machine = match Machine::load(text) {
             Ok(machine) => machine,
             Err(e) => {
@@ -52,7 +47,7 @@ impl Robot {
                 return Upload::Refused(e.to_string());
             }
         };
-        if first == "sec" {
+        if machine.kind() == ProgramKind::Secondary {
             if self.programs.secondary.len() >= MOST_SECONDARY {
                 return Upload::Refused("too many secondary programs".to_owned());
             }

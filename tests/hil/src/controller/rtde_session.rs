@@ -211,7 +211,7 @@ impl RtdeSession {
         } else {
             0
         };
-        self.outputs = whole.then(|| OutputRecipe { id, fields, period: top / frequency, left: 0.0 });
+        self.outputs = whole.then(|| OutputRecipe { id, fields, period: top / frequency, left: 1.0 });
         let types = words.join(",");
         let mut answer = Vec::with_capacity(types.len() + 1);
         if self.version == 2 {

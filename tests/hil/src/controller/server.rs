@@ -6,9 +6,9 @@
 use super::command::{Command, Port, WireAction};
 use super::connection::{Connection, READ, Role, lines};
 use super::rtde_session::RtdeSession;
-use super::script_stream::{Script, ScriptStream};
 use super::world::World;
 use super::{dashboard, primary};
+use crate::urscript::{Collector, Upload};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use serde_json::json;
 use std::net::{IpAddr, SocketAddr, TcpListener};
@@ -142,7 +142,7 @@ impl Server {
             match &mut c.role {
                 Role::State { .. } => {
                     if !messages.is_empty() && c.port == Port::Primary {
-                        c.send(&messages, &wire, now, random);
+                        c.send_newest(&messages, &wire, now, random);
                     }
                     if steps % every == 0 {
                         let full = steps % (10 * every) == 0;
@@ -226,7 +226,7 @@ impl Server {
             }
             let id = self.next_id;
             self.next_id += 1;
-            let scripts = || (!read_only).then(ScriptStream::default);
+            let scripts = || (!read_only).then(Collector::default);
             let role = match port {
                 Port::Dashboard => Role::Dashboard(Vec::new()),
                 Port::Primary | Port::Secondary => Role::State { scripts: scripts() },
@@ -321,16 +321,20 @@ fn receive(c: &mut Connection, world: &mut World, buffer: &mut [u8], now: u64) {
             }
             Err(()) => c.over = Some("sent a line without an end"),
         },
-        Role::State { scripts: Some(stream) } | Role::Realtime { scripts: Some(stream) } => {
-            let mut programs = Vec::new();
-            stream.receive(&bytes, |p| programs.push(p));
-            for program in programs {
-                match program {
-                    Script::Program(text) => world.upload(now, &text),
-                    Script::TooLong => world.note(now, "script dropped: too long"),
+        Role::State { scripts: Some(stream) } | Role::Realtime { scripts: Some(stream) } => match stream.push(&bytes) {
+            Ok(uploads) => {
+                for upload in uploads {
+                    match upload {
+                        Upload::Program(text) => world.upload(now, &text),
+                        Upload::StopProgram => {
+                            world.note(now, "stop program");
+                            world.robot.stop_program();
+                        }
+                    }
                 }
             }
-        }
+            Err(reason) => c.over = Some(reason),
+        },
         // The read-only ports hear nothing.
         Role::State { scripts: None } | Role::Realtime { scripts: None } => {}
         Role::Rtde(session) => {

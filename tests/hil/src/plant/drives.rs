@@ -23,6 +23,8 @@ pub struct Drives {
     max_accel: f64,
     fault: DriveFault,
     braked: bool,
+    /// How far the drift has carried each joint away from where its own loop believes it to be, rad.
+    drifted: Joints,
 }
 
 /// Time constant of the velocity loop, s.
@@ -35,11 +37,24 @@ const COUNTS_PER_RAD: f64 = 1_048_576.0 / std::f64::consts::TAU;
 impl Drives {
     /// At rest at `q`.
     pub fn new(q: Joints, max_accel: f64) -> Self {
-        Drives { q, qd: [0.0; 6], qdd: [0.0; 6], max_accel, fault: DriveFault::default(), braked: false }
+        Drives {
+            q,
+            qd: [0.0; 6],
+            qdd: [0.0; 6],
+            max_accel,
+            fault: DriveFault::default(),
+            braked: false,
+            drifted: [0.0; 6],
+        }
     }
 
     /// Puts a disturbance on the joints; the default takes it away.
     pub fn set_fault(&mut self, fault: DriveFault) {
+        for i in 0..6 {
+            if fault.drift[i] == 0.0 {
+                self.drifted[i] = 0.0;
+            }
+        }
         self.fault = fault;
     }
 
@@ -61,7 +76,9 @@ impl Drives {
             let wanted = if self.braked {
                 0.0
             } else {
-                target_qd[i] + POSITION_GAIN / (1.0 + self.fault.lag_s / VELOCITY_LAG_S) * (target_q[i] - self.q[i])
+                target_qd[i]
+                    + POSITION_GAIN / (1.0 + self.fault.lag_s / VELOCITY_LAG_S)
+                        * (target_q[i] - self.q[i] + self.drifted[i])
             };
             let before = self.qd[i];
             let change = if self.braked { -before } else { blend * (wanted - before) };
@@ -71,6 +88,7 @@ impl Drives {
             }
             self.qdd[i] = (self.qd[i] - before) / dt;
             self.q[i] += (self.qd[i] + self.fault.drift[i]) * dt;
+            self.drifted[i] += self.fault.drift[i] * dt;
         }
     }
 
