@@ -208,9 +208,8 @@ fn a_client_that_does_not_read_is_cut_off_and_a_slow_one_gets_the_newest() {
 fn faults_of_the_wire_do_what_they_say() {
     let mut mock = host();
     let mut s = receiver(&mock);
-    timestamp(&mut s).unwrap();
-    mock.ask(&Command::LoseDownstream { port: Default::default(), seconds: 0.3 }).unwrap();
     let mut last = timestamp(&mut s).unwrap();
+    mock.ask(&Command::LoseDownstream { port: Default::default(), seconds: 0.3 }).unwrap();
     let gap = (0..1500).any(|_| {
         let now = timestamp(&mut s).unwrap();
         let step = now - last;
