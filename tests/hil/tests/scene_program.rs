@@ -1,0 +1,171 @@
+//! `graspd-scene` as a process: frames over shared memory, the truth over a pipe, faults on command, an end with its parent.
+
+use graspd_hil::scenario::{Options, Scenario};
+use graspd_shm::frame::{FramePolicy, FrameSubscriber, Reject, id_hash};
+use graspd_shm::{Names, create_node};
+use serde_json::Value;
+use std::io::{BufRead, BufReader, Write};
+use std::path::PathBuf;
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::time::{Duration, Instant};
+
+fn now_ns() -> u64 {
+    let t = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    t.tv_sec as u64 * 1_000_000_000 + t.tv_nsec as u64
+}
+
+struct Scene {
+    child: Child,
+    stdin: ChildStdin,
+    out: BufReader<ChildStdout>,
+    names: Names,
+    ready: Value,
+    dir: PathBuf,
+}
+
+impl Scene {
+    fn start(tag: &str, extra: &[&str]) -> Self {
+        let tag = format!("gs{tag}{}", std::process::id());
+        let dir = std::env::temp_dir().join(format!("graspd-{tag}"));
+        let names = Names::new(dir.join("shm"), &format!("{tag}_"), "test").unwrap();
+        let scenario = Scenario::from_seed(11, &Options::default()).unwrap();
+        scenario.save(&dir.join("world")).unwrap();
+        let mut child = Command::new(env!("CARGO_BIN_EXE_graspd-scene"))
+            .arg("--world")
+            .arg(dir.join("world"))
+            .arg("--shm-root")
+            .arg(names.root())
+            .args(["--shm-prefix", names.prefix(), "--cell", "test", "--rate", "30", "--exit-with-stdin"])
+            .args(["--max-seconds", "120"])
+            .args(extra)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let stdin = child.stdin.take().unwrap();
+        let mut out = BufReader::new(child.stdout.take().unwrap());
+        let mut line = String::new();
+        out.read_line(&mut line).unwrap();
+        let ready: Value = serde_json::from_str(&line).unwrap();
+        Self { child, stdin, out, names, ready, dir }
+    }
+
+    fn ask(&mut self, line: &str) -> Value {
+        writeln!(self.stdin, "{line}").unwrap();
+        let mut answer = String::new();
+        self.out.read_line(&mut answer).unwrap();
+        serde_json::from_str(&answer).unwrap()
+    }
+
+    /// Closes the pipe; the program must end by itself.
+    fn end(mut self) {
+        drop(self.stdin);
+        let until = Instant::now() + Duration::from_secs(10);
+        let status = loop {
+            match self.child.try_wait().unwrap() {
+                Some(s) => break Some(s),
+                None if Instant::now() > until => break None,
+                None => std::thread::sleep(Duration::from_millis(20)),
+            }
+        };
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        let _ = std::fs::remove_dir_all(&self.dir);
+        assert!(status.is_some_and(|s| s.success()), "{status:?}");
+    }
+}
+
+/// Polls until the condition holds, at most ten seconds.
+fn until(mut f: impl FnMut() -> bool) -> bool {
+    let end = Instant::now() + Duration::from_secs(10);
+    while Instant::now() < end {
+        if f() {
+            return true;
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    false
+}
+
+#[test]
+fn frames_truth_and_faults() {
+    let mut scene = Scene::start("a", &[]);
+    assert_eq!(scene.ready["ready"], true);
+    assert_eq!(scene.ready["service"], "test/frames/stereo");
+    let node = create_node(&scene.names, "test").unwrap();
+    let policy = FramePolicy {
+        size: Some((1280, 1024)),
+        cameras: [id_hash("sim-left"), id_hash("sim-right")],
+        ..Default::default()
+    };
+    let mut frames = FrameSubscriber::new(&node, policy).unwrap();
+    let mut seen = 0;
+    let mut stamps = Vec::new();
+    assert!(until(|| {
+        if let Some(f) = frames.newest(now_ns()).frame {
+            seen += 1;
+            stamps.push(f.capture_ns()[0]);
+            let (l, r) = (f.mono8(0).unwrap(), f.mono8(1).unwrap());
+            assert_ne!(l, r);
+            let mean = l.iter().map(|p| f64::from(*p)).sum::<f64>() / l.len() as f64;
+            assert!((30.0..200.0).contains(&mean), "{mean}");
+        }
+        seen >= 10
+    }));
+    // Stamps lie on the camera's grid.
+    let period = 1_000_000_000 / 30;
+    assert!(stamps.windows(2).all(|w| (w[1] - w[0]).is_multiple_of(period)), "{stamps:?}");
+    assert_eq!(frames.stats().rejected_total(), 0, "{:?}", frames.stats());
+
+    // The truth of an arm at rest at its start is the scenario's own.
+    let scenario = Scenario::load(&scene.dir.join("world")).unwrap();
+    let want = scenario.truth(&scenario.start, 0.0);
+    let truth = scene.ask(r#"{"ask":"truth"}"#);
+    assert!((truth["grasp"]["position_error_mm"].as_f64().unwrap() - want.position_error_mm).abs() < 1e-6, "{truth}");
+    let standoff = truth["pregrasp"]["standoff_m"].as_f64().unwrap();
+    assert!((standoff - graspd_hil::scenario::STANDOFF_M).abs() < 1e-12);
+
+    // Faults show as the refusal they are meant to cause, and go when cleared.
+    for (fault, reject) in [
+        (r#"{"fault":"skew","ms":8}"#, Reject::Skew),
+        (r#"{"fault":"swap","ids":true}"#, Reject::Cameras),
+        (r#"{"fault":"incomplete","eye":1}"#, Reject::Incomplete),
+        (r#"{"fault":"stamp","ms":50}"#, Reject::Future),
+        (r#"{"fault":"header","field":"width","value":4294967295}"#, Reject::Size),
+        (r#"{"fault":"header","field":"offset","value":18446744073709551610}"#, Reject::Bounds),
+        (r#"{"fault":"repeat_sequence"}"#, Reject::Sequence),
+        (r#"{"fault":"second_publisher"}"#, Reject::Foreign),
+    ] {
+        assert_eq!(scene.ask(fault)["ok"], true, "{fault}");
+        assert!(until(|| frames.newest(now_ns()).last_reject == Some(reject)), "{fault}: {:?}", frames.stats());
+        assert_eq!(scene.ask(r#"{"clear":true}"#)["ok"], true);
+        assert!(until(|| frames.newest(now_ns()).frame.is_some()), "{fault}: no recovery");
+    }
+    // A frozen eye has the same pixels, a live one never.
+    assert_eq!(scene.ask(r#"{"fault":"freeze","eye":1}"#)["ok"], true);
+    let mut prints: Vec<[u64; 2]> = Vec::new();
+    assert!(until(|| {
+        prints.extend(frames.newest(now_ns()).frame.map(|f| f.fingerprint()));
+        prints.windows(2).any(|w| w[0][1] == w[1][1] && w[0][0] != w[1][0])
+    }));
+    assert_eq!(scene.ask(r#"{"fault":"freez"}"#)["ok"], false);
+    assert_eq!(scene.ask("nonsense")["ok"], false);
+    scene.end();
+}
+
+#[test]
+fn bad_input_ends_with_the_documented_code_and_a_reason() {
+    for (args, code, part) in [
+        (vec!["--rate", "0"], 2, "--rate"),
+        (vec![], 2, "--world"),
+        (vec!["--world", "/nonexistent/world"], 3, "truth.toml"),
+        (vec!["--seed", "1", "--fault", "{\"fault\":\"nothing\"}"], 2, "nothing"),
+        (vec!["--seed", "1", "--cell", "Bad Cell"], 3, "cell"),
+        (vec!["--unknown"], 2, "--unknown"),
+    ] {
+        let o = Command::new(env!("CARGO_BIN_EXE_graspd-scene")).args(&args).stdin(Stdio::null()).output().unwrap();
+        let said = String::from_utf8_lossy(&o.stderr);
+        assert_eq!(o.status.code(), Some(code), "{args:?}: {said}");
+        assert!(said.contains(part), "{args:?}: {said}");
+    }
+}
