@@ -131,7 +131,7 @@ pub fn object_frame(r: &Reconstruction) -> Pose {
     let f = frame_of(&r.rim.normal);
     let x = if r.is_round() { f.column(0).into_owned() } else { r.rim.axis_a };
     let m = nalgebra::Matrix3::from_columns(&[x, r.rim.normal.cross(&x), r.rim.normal]);
-    let rotation = nalgebra::UnitQuaternion::from_matrix(&m);
+    let rotation = nalgebra::UnitQuaternion::from_rotation_matrix(&nalgebra::Rotation3::from_matrix_unchecked(m));
     Pose::from_parts(r.rim.centre.into(), rotation)
 }
 

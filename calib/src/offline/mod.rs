@@ -23,6 +23,7 @@ pub mod picture;
 pub mod plan;
 pub mod planar;
 pub mod plane;
+pub mod polyhedral;
 pub mod propose;
 mod quick_fit;
 pub mod reconstruct;
