@@ -55,7 +55,7 @@ pub fn answers(list: &str) -> impl Iterator<Item = Option<Answer>> + Clone + '_ 
 ///
 /// # Errors
 /// When `out` is too small; nothing useful is in it then.
-pub fn join<'o, W: fmt::Display>(words: impl IntoIterator<Item = W>, out: &'o mut [u8]) -> Result<&'o str, NoRoom> {
+pub fn join<W: fmt::Display>(words: impl IntoIterator<Item = W>, out: &mut [u8]) -> Result<&str, NoRoom> {
     use fmt::Write;
     struct Sink<'a> {
         out: &'a mut [u8],
