@@ -95,6 +95,9 @@ impl Cell {
             &s(&world.join("true_arm.toml")),
             "--record",
             &s(&folder.join("wire.jsonl")),
+            // What the daemon promises by its configuration: the mock judges every set-point by it.
+            "--limits",
+            "0.5,4.0",
             "--exit-with-stdin",
         ]
         .map(str::to_owned)

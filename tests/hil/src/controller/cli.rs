@@ -37,8 +37,8 @@ pub struct Args {
     #[arg(long, value_name = "PORT")]
     pub control_port: Option<u16>,
     /// Joint positions at the start, rad
-    #[arg(long, value_delimiter = ',', num_args = 6, value_name = "Q1,..,Q6", allow_negative_numbers = true)]
-    pub start_joints: Option<Vec<f64>>,
+    #[arg(long, value_parser = numbers::<6>, value_name = "Q1,..,Q6", allow_hyphen_values = true)]
+    pub start_joints: Option<[f64; 6]>,
     /// The unit's own DH parameters: TOML with a [dh] table of a, d, alpha, theta
     #[arg(long, value_name = "FILE")]
     pub kinematics: Option<PathBuf>,
@@ -46,8 +46,8 @@ pub struct Args {
     #[arg(long, value_name = "HZ")]
     pub rate: Option<f64>,
     /// Rate (rad/s) and acceleration (rad/s^2) that the client promised to keep; the oracle holds it to them
-    #[arg(long, value_delimiter = ',', num_args = 2, value_name = "V,A")]
-    pub limits: Option<Vec<f64>>,
+    #[arg(long, value_parser = numbers::<2>, value_name = "V,A")]
+    pub limits: Option<[f64; 2]>,
     /// Start without power
     #[arg(long)]
     pub powered_off: bool,
@@ -115,13 +115,19 @@ where
     }
 }
 
+/// Numbers joined by commas, as many as are needed.
+fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
+    let all: Result<Vec<f64>, _> = text.split(',').map(|n| n.trim().parse::<f64>()).collect();
+    all.ok().and_then(|v| v.try_into().ok()).ok_or_else(|| format!("give {N} numbers joined by commas"))
+}
+
 fn setup(args: &Args) -> Result<Setup, StartError> {
     let model = Model::by_name(&args.model)?;
     let mut setup = Setup::new(model);
     if let Some(path) = &args.kinematics {
         setup.kinematics = Kinematics::from_file(path)?;
     }
-    if let Some(q) = args.start_joints.as_ref().and_then(|q| q.first_chunk::<6>()) {
+    if let Some(q) = &args.start_joints {
         let limit = model.position_limit();
         if let Some((_, bad)) = q.iter().enumerate().find(|(i, v)| !v.is_finite() || v.abs() >= limit[*i]) {
             return Err(StartError::Joint(*bad));
@@ -146,10 +152,10 @@ fn setup(args: &Args) -> Result<Setup, StartError> {
 
 fn run(args: &Args) -> Result<(), StartError> {
     let setup = setup(args)?;
-    let limits = match args.limits.as_deref() {
-        Some(&[v, a]) if v > 0.0 && a > 0.0 => Some((v, a)),
-        Some(&[v, a]) => return Err(StartError::Limits(v, a)),
-        _ => None,
+    let limits = match args.limits {
+        Some([v, a]) if v > 0.0 && a > 0.0 => Some((v, a)),
+        Some([v, a]) => return Err(StartError::Limits(v, a)),
+        None => None,
     };
     let recorder = match &args.record {
         Some(path) => Some(Recorder::create(path).map_err(|e| StartError::Record(path.clone(), e))?),
