@@ -164,7 +164,7 @@ fn kinematics(
     stop: &AtomicBool,
 ) -> Result<Option<Dh>, Failure> {
     match (&config.kinematics, config.link) {
-        (Kinematics::File(path), _) => load_kinematics(path).map(Some),
+        (Kinematics::File(path), _) => load_kinematics(path, config.model).map(Some),
         (Kinematics::Nominal, _) | (Kinematics::Controller, LinkKind::Mock) => Ok(Some(Dh::nominal(config.model))),
         (Kinematics::Controller, LinkKind::Rtde) => loop {
             match crate::arm::read_identity(&ur_config(config)) {

@@ -35,7 +35,7 @@ pub fn render(config: &UrConfig, token: i32, step_s: f64) -> Result<String, ArmE
     positive("loop.rate_hz", config.beat_hz, 1000.0)?;
     positive("arm.watchdog_ms", config.watchdog_ms, 1000.0)?;
     // The script's own patience ends before the controller's watchdog, and never within two and a half beats of a slow loop.
-    let patience_s = 0.020f64.max(2.5 / config.beat_hz);
+    let patience_s = (0.8e-3 * config.watchdog_ms).max(2.5 / config.beat_hz);
     let watchdog_s = (config.watchdog_ms * 1e-3).max(patience_s + 2.0 * step_s);
     let limits: Vec<String> = config.speed_limits.iter().map(|v| format!("{v:.6}")).collect();
     let filled = [
@@ -103,7 +103,7 @@ mod tests {
     fn everything_is_filled_in() {
         let text = render(&UrConfig::new("localhost", Model::Ur5e), 77, 0.002).unwrap();
         assert!(!text.replace("The daemon fills in the {{...}}", "").contains("{{"), "{text}");
-        assert!(text.contains("TOKEN = 77") && text.contains("PATIENCE_STEPS = 10"));
+        assert!(text.contains("TOKEN = 77") && text.contains("PATIENCE_STEPS = 20"));
         assert!(text.contains("rtde_set_watchdog(\"input_int_register_25\", 20.000, \"stop\")"));
         assert!(text.is_ascii() && !text.contains('\t'));
     }

@@ -2,7 +2,7 @@
 
 use super::settings::Config;
 use crate::exit::Failure;
-use graspd_rt::arm::Dh;
+use graspd_rt::arm::{Dh, Model};
 use graspd_rt::cycle::{ConvergeSettings, CycleConfig, CycleSettings, WatchSettings};
 use graspd_rt::guard::LimitSettings;
 use graspd_rt::online::path::PathSettings;
@@ -38,12 +38,11 @@ pub fn cycle_config(c: &Config, dh: Dh, realtime: bool) -> CycleConfig {
         ..LimitSettings::default()
     };
     let frame_period_ns = (1e9 / raw.vision.frame_rate_hz) as u64;
-    let mut watch = WatchSettings { skew_ns: (raw.vision.max_skew_ms * 1e6) as u64, ..WatchSettings::default() };
-    if !realtime {
-        // A host without real-time scheduling misses beats as a matter of course: they are counted and said, and only a stall
-        // stops the arm (the robot's own watchdog stands behind that).
-        watch.overruns_per_s = 0;
-    }
+    // A host without real-time scheduling misses beats as a matter of course: they are counted and said, and only a stall stops
+    // the arm (the robot's own watchdog stands behind that).
+    let strict = realtime && !raw.beat.best_effort;
+    let mut watch = if strict { WatchSettings::default() } else { WatchSettings::best_effort() };
+    watch.skew_ns = (raw.vision.max_skew_ms * 1e6) as u64;
     CycleConfig {
         model: c.model,
         dh,
@@ -75,6 +74,8 @@ pub fn cycle_config(c: &Config, dh: Dh, realtime: bool) -> CycleConfig {
 #[derive(serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 struct KinematicsFile {
+    /// The model that the table belongs to; compared with the configuration's where it is given.
+    model: Option<String>,
     dh: DhTable,
 }
 
@@ -87,11 +88,12 @@ struct DhTable {
     theta: [f64; 6],
 }
 
-/// Reads an arm's Denavit-Hartenberg table: `[dh]` with `a`, `d` (m), `alpha`, `theta` (rad), six numbers each.
+/// Reads an arm's Denavit-Hartenberg table: `[dh]` with `a`, `d` (m), `alpha`, `theta` (rad), six numbers each, and optionally the
+/// `model` that it belongs to.
 ///
 /// # Errors
-/// Names the file, the key and the fix.
-pub fn load_kinematics(path: &Path) -> Result<Dh, Failure> {
+/// Names the file, the key and the fix; another model's table is refused.
+pub fn load_kinematics(path: &Path, model: Model) -> Result<Dh, Failure> {
     let shown = path.display();
     let text = std::fs::read_to_string(path).map_err(|e| {
         Failure::input(format!(
@@ -101,6 +103,12 @@ pub fn load_kinematics(path: &Path) -> Result<Dh, Failure> {
     let file: KinematicsFile = toml::from_str(&text).map_err(|e| {
         Failure::input(format!("{shown}: {e}\nExpected a table [dh] with a, d, alpha, theta of six numbers each."))
     })?;
+    if let Some(other) = file.model.filter(|m| m != model.name()) {
+        return Err(Failure::input(format!(
+            "{shown}: model = \"{other}\", but arm.model is \"{}\": give the kinematics of this arm",
+            model.name()
+        )));
+    }
     let t = file.dh;
     for (name, values, limit) in [("a", t.a, 3.0), ("d", t.d, 3.0), ("alpha", t.alpha, 7.0), ("theta", t.theta, 7.0)] {
         for (i, v) in values.iter().enumerate() {

@@ -96,6 +96,9 @@ pub struct RawLoop {
     pub spin_us: f64,
     /// Refuse to start on a host that does not give priority and locked memory.
     pub require_realtime: bool,
+    /// Count missed beats instead of holding the arm for them, and allow twice the delay before a fault: for a shared or ordinary
+    /// host. Without real-time priority it is so in any case.
+    pub best_effort: bool,
 }
 
 impl Default for RawLoop {
@@ -108,6 +111,7 @@ impl Default for RawLoop {
             vision_core: None,
             spin_us: 0.0,
             require_realtime: false,
+            best_effort: false,
         }
     }
 }

@@ -142,7 +142,7 @@ fn config_text(args: &DemoArgs, cell: &str, offset: u16, model: &str) -> String 
     format!(
         "# Written by graspd demo.\ncell = \"{cell}\"\n\n[files]\nrig = \"world/rig.toml\"\ngripper = \"world/gripper.toml\"\n\n\
          [shm]\nroot = \"shm\"\n\n[arm]\nlink = \"rtde\"\naddress = \"127.0.0.1\"\nport_offset = {offset}\nmodel = \"{model}\"\n\
-         kinematics = \"world/arm.toml\"\n\n[servo]\nviews = \"{}\"\n",
+         kinematics = \"world/arm.toml\"\n\n# A simulated world shares its processors with the daemon.\n[loop]\nbest_effort = true\n\n[servo]\nviews = \"{}\"\n",
         args.views
     )
 }
