@@ -1,4 +1,5 @@
 //! The UR link against peers that misbehave, over loopback TCP. Every wait is bounded; no time is asserted from below.
+#![allow(clippy::unwrap_used)] // a helper that fails is a test that fails
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};

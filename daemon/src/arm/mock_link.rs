@@ -164,12 +164,14 @@ impl MockArm {
         let far = wanted.iter().zip(self.target_qd).fold(0.0f64, |m, (w, v)| m.max((w - v).abs()));
         let share = if far > 0.0 { (self.limits.acceleration * dt / far).min(1.0) } else { 0.0 };
         let follow = 1.0 - (-dt / self.limits.lag_s.max(1e-6)).exp();
-        for i in 0..6 {
-            self.target_qd[i] += share * (wanted[i] - self.target_qd[i]);
-            self.target_q[i] += self.target_qd[i] * dt;
-            let before = self.q[i];
-            self.q[i] += follow * (self.target_q[i] - before);
-            self.qd[i] = (self.q[i] - before) / dt;
+        let targets = self.target_q.iter_mut().zip(&mut self.target_qd).zip(wanted);
+        let actual = self.q.iter_mut().zip(&mut self.qd);
+        for (((target_q, target_qd), wanted), (q, qd)) in targets.zip(actual) {
+            *target_qd += share * (wanted - *target_qd);
+            *target_q += *target_qd * dt;
+            let moved = follow * (*target_q - *q);
+            *q += moved;
+            *qd = moved / dt;
         }
         self.clock_s += dt;
     }
