@@ -200,7 +200,8 @@ fn one_byte_at_a_time_is_as_good_as_any() {
 
 #[test]
 fn every_kind_of_damage_ends_the_link_with_its_name() {
-    let cases: [(&[u8], fn(LinkFault) -> bool); 7] = [
+    type Expected = fn(LinkFault) -> bool;
+    let cases: [(&[u8], Expected); 7] = [
         (b"\x00\x02U", |f| matches!(f, LinkFault::Framing(FrameError::TooShort { size: 2 }))),
         (b"\x00\x03Z", |f| matches!(f, LinkFault::Protocol(ClientError::Message(MessageError::UnknownKind(b'Z'))))),
         (b"\x00\x05U\x01\x00", |f| matches!(f, LinkFault::Protocol(ClientError::DataLength { found: 1, .. }))),
