@@ -144,8 +144,8 @@ impl Server {
                     if !messages.is_empty() && c.port == Port::Primary {
                         c.send_newest(&messages, &wire, now, random);
                     }
-                    if steps % every == 0 {
-                        let full = steps % (10 * every) == 0;
+                    if steps.is_multiple_of(every) {
+                        let full = steps.is_multiple_of(10 * every);
                         let bytes = state.get_or_insert_with(|| primary::robot_state(&self.world.robot, full));
                         c.send_newest(bytes, &wire, now, random);
                     }
@@ -159,7 +159,7 @@ impl Server {
                     if session.sample(&self.world.robot, &mut sample) {
                         c.counted = c.counted.wrapping_add(1);
                         let keep = self.world.rtde_faults.keep_one_of.max(1);
-                        if c.counted % keep == 0 {
+                        if c.counted.is_multiple_of(keep) {
                             c.send_newest(&sample, &wire, now, random);
                         }
                     }

@@ -401,10 +401,10 @@ impl Generator {
                     v.clamp(-self.max_speed[i], self.max_speed[i]) * self.scaling
                 });
                 let goal = self.reduce(goal);
-                for i in 0..6 {
-                    let most = MAX_TARGET_ACCEL * dt;
-                    self.qd[i] += (goal[i] - self.qd[i]).clamp(-most, most);
-                    self.q[i] += self.qd[i] * dt;
+                let most = MAX_TARGET_ACCEL * dt;
+                for ((q, qd), goal) in self.q.iter_mut().zip(&mut self.qd).zip(goal) {
+                    *qd += (goal - *qd).clamp(-most, most);
+                    *q += *qd * dt;
                 }
             }
             _ => {}

@@ -7,14 +7,14 @@ use nalgebra::{Isometry3, Vector3};
 pub fn gravity_torques(kinematics: &Kinematics, masses: &Joints, payload: f64, q: &Joints) -> Joints {
     let mut torque = [0.0; 6];
     // A link's mass sits half way back along its own a and d: found as a tool of the shortened chain.
-    for link in 0..6 {
+    for (link, own_mass) in masses.iter().enumerate() {
         let mut part = *kinematics;
         for row in &mut part.rows[link..] {
             (row.a, row.d) = (0.0, 0.0);
         }
         part.rows[link].a = kinematics.rows[link].a / 2.0;
         part.rows[link].d = kinematics.rows[link].d / 2.0;
-        let mass = masses[link] + if link == 5 { payload } else { 0.0 };
+        let mass = own_mass + if link == 5 { payload } else { 0.0 };
         let j = part.jacobian(q, &Isometry3::identity());
         let weight = Vector3::new(0.0, 0.0, mass * 9.82);
         for (joint, t) in torque.iter_mut().enumerate().take(link + 1) {

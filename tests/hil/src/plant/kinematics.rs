@@ -113,9 +113,9 @@ impl Kinematics {
         let frames = self.frames(q);
         let tip = (isometry(&frames[6]) * flange_from_tcp).translation.vector;
         let mut j = Matrix6::zeros();
-        for i in 0..6 {
-            let axis = Vector3::new(frames[i][(0, 2)], frames[i][(1, 2)], frames[i][(2, 2)]);
-            let origin = Vector3::new(frames[i][(0, 3)], frames[i][(1, 3)], frames[i][(2, 3)]);
+        for (i, frame) in frames.iter().enumerate().take(6) {
+            let axis = Vector3::new(frame[(0, 2)], frame[(1, 2)], frame[(2, 2)]);
+            let origin = Vector3::new(frame[(0, 3)], frame[(1, 3)], frame[(2, 3)]);
             let linear = axis.cross(&(tip - origin));
             j.fixed_view_mut::<3, 1>(0, i).copy_from(&linear);
             j.fixed_view_mut::<3, 1>(3, i).copy_from(&axis);
