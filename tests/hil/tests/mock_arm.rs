@@ -98,7 +98,11 @@ fn the_daemons_script_moves_the_arm_within_its_promise() {
 
 #[test]
 fn a_client_that_dies_in_motion_leaves_the_arm_at_rest_within_watchdog_and_ramp() {
-    for (steps, rate) in [(0, 0.1), (3, 0.25), (17, 0.5), (40, 0.5)] {
+    let mut slowest = 0.0f64;
+    for k in 0..100u32 {
+        // A hundred instants and speeds, spread by the golden ratio: the same in every run.
+        let spread = f64::from(k) * 0.618_033_988_75 % 1.0;
+        let (steps, rate) = ((spread * 83.0) as u32, 0.1 + 0.4 * f64::from(k) / 99.0);
         let mut c = Client::ready();
         c.run_up(rate);
         for _ in 0..steps {
@@ -108,11 +112,14 @@ fn a_client_that_dies_in_motion_leaves_the_arm_at_rest_within_watchdog_and_ramp(
         assert!(c.arm.step_until(1.0, |r| r.at_rest()), "still moving a second later");
         let last = *c.arm.summary().episodes.last().unwrap();
         let bound = 0.050 + rate / 4.0 + 0.030; // the drives trail their targets by a few hundredths
-        assert!(last.stop_ns().unwrap() as f64 * 1e-9 <= bound, "{last:?}");
-        assert!(!c.arm.step_until(1.0, |r| !r.at_rest()), "it moved again by itself");
+        let took = last.stop_ns().unwrap() as f64 * 1e-9;
+        slowest = slowest.max(took - rate / 4.0);
+        assert!(took <= bound, "{last:?}");
+        assert!(!c.arm.step_until(0.5, |r| !r.at_rest()), "it moved again by itself");
         // Its watchdog ended the program, too.
         assert_eq!(c.arm.robot().runtime, RuntimeState::Stopped);
     }
+    println!("slowest of 100: {:.1} ms beyond the ramp", slowest * 1e3);
 }
 
 #[test]
