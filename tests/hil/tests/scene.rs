@@ -29,7 +29,7 @@ fn drawn_cells_start_in_range_with_all_marks_in_view_and_differ() {
         let body = Body::new(&s.gripper);
         let left = s.left_from_object();
         for (pose, least) in [(start, 9), (s.object_from_grasp(STANDOFF_M), 7), (s.object_from_grasp(0.0), 7)] {
-            let seen = seen_marks(&body, &s.true_rig, &(left * pose), 0.14, 10.0);
+            let seen = seen_marks(&body, &s.true_rig, &(left * pose), 0.17, 10.0);
             assert!(seen.both >= least, "seed {seed}: {seen:?}");
         }
         // The grasp it was drawn for is one: no error, and the axis is where it should be.
@@ -153,7 +153,7 @@ fn discs_lie_where_projection_says() {
     for view in View::BOTH {
         let camera = s.true_rig.camera(view);
         let view_from_object = s.true_rig.view_from_left(view) * s.left_from_object();
-        r.draw(view, &shot(Some(pose), 0.14), &mut p, w);
+        r.draw(view, &shot(Some(pose), 0.17), &mut p, w);
         for m in &s.gripper.gripper.marks {
             let centre = (view_from_object * pose * Point3::from(m.position)).coords;
             let normal = (view_from_object * pose).rotation * m.normal;
@@ -176,7 +176,7 @@ fn the_painted_circle_lies_where_projection_says() {
     for view in View::BOTH {
         let camera = s.true_rig.camera(view);
         let view_from_object = s.true_rig.view_from_left(view) * s.left_from_object();
-        r.draw(view, &shot(None, 0.14), &mut p, w);
+        r.draw(view, &shot(None, 0.17), &mut p, w);
         // The centre of the gradient across the outer and the inner edge.
         let [inner, outer] = s.stage.wheel.paint_radii().unwrap();
         let project = |radius: f64, a: f64| {
@@ -218,7 +218,7 @@ fn the_valve_hides_what_is_behind_it_and_is_hidden_by_what_is_in_front() {
     let camera = &s.true_rig.left;
     let mut draw = |pose: Option<Pose>| {
         let mut p = vec![0u8; w * h];
-        r.draw(View::Left, &shot(pose, 0.14), &mut p, w);
+        r.draw(View::Left, &shot(pose, 0.17), &mut p, w);
         p
     };
     let empty = draw(None);

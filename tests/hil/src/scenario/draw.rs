@@ -3,7 +3,7 @@
 use super::reach::{line, seen_marks, straight_path};
 use super::{Options, STANDOFF_M, Scenario, default_gripper, grasp_pose};
 use crate::scene::{Body, Sensor, Stage, Wheel};
-use graspd_rt::arm::{Dh, Joints, Model, closed_form};
+use graspd_rt::arm::{Dh, Joints, closed_form};
 use graspd_rt::geom::{Camera, Distortion, Pixel, Pose, Rig, Vec3, View};
 use nalgebra::{Matrix3, Point3, Rotation3, Translation3, UnitQuaternion};
 use rand::{Rng, RngExt, SeedableRng};
@@ -207,8 +207,9 @@ fn draw_stage(
     towards: &Vec3,
 ) -> (Stage, Sensor) {
     let to_object = base_from_object.rotation.inverse();
-    // A lamp over the cameras' shoulder, never behind the valve.
-    let mut light = to_object * (towards + unit(rng) * 0.7);
+    // A hall's diffuse light and a lamp over the cameras' shoulder, never behind the valve. (Hard light from the side shades a painted
+    // bar so that its edges seem to move towards the lamp by more than a tenth of a pixel; nobody would set up a cell so.)
+    let mut light = to_object * (towards + unit(rng) * 0.5);
     light.z = light.z.max(0.35);
     let pipe_angle_rad = rng.random_range(0.0..PI);
     let wall_m = wheel.stem_m + rng.random_range(0.12..0.3);
@@ -226,19 +227,19 @@ fn draw_stage(
         bolts_m,
         albedo: [
             rng.random_range(0.80..0.92),
-            rng.random_range(0.14..0.26),
-            rng.random_range(0.20..0.35),
-            rng.random_range(0.35..0.5),
-            rng.random_range(0.42..0.60),
+            rng.random_range(0.20..0.30),
+            rng.random_range(0.20..0.32),
+            rng.random_range(0.25..0.40),
+            rng.random_range(0.32..0.46),
         ],
         light: light.normalize().into(),
-        ambient: rng.random_range(0.35..0.5),
-        diffuse: rng.random_range(0.5..0.65),
+        ambient: rng.random_range(0.60..0.72),
+        diffuse: rng.random_range(0.28..0.40),
         texture: rng.random_range(0.04..0.12),
         white: rng.random_range(215.0..250.0),
     };
     let sensor = Sensor {
-        blur_px: rng.random_range(0.5..0.75),
+        blur_px: rng.random_range(0.4..0.65),
         vignetting: rng.random_range(0.08..0.22),
         read_noise: o.noise * rng.random_range(0.7..1.5),
         shot_noise: o.noise * o.noise * rng.random_range(0.008..0.02),
@@ -259,7 +260,6 @@ fn draw_start(s: &Scenario, body: &Body, rng: &mut ChaCha8Rng) -> Option<Joints>
     if !ends_seen {
         return None;
     }
-    // The arm can do grasp and pre-grasp also when the plan turns the gripper somewhat otherwise about the axis.
     for _ in 0..6 {
         let away = unit(rng);
         let away = Vec3::new(away.x, away.y, away.z.abs() + 0.5).normalize();
@@ -281,13 +281,16 @@ fn draw_start(s: &Scenario, body: &Body, rng: &mut ChaCha8Rng) -> Option<Joints>
         let poses: Vec<Pose> = object_poses.iter().map(|p| s.base_from_object * p).collect();
         let first = poses.first()? * flange_from_gripper.inverse();
         for q in closed_form(&s.model.dh(), &first, 0.0) {
-            let q = settled(s.model, q);
+            let q = settled(q);
             let Some(path) = straight_path(s.model, &s.true_dh, &flange_from_gripper, &poses, &q) else { continue };
-            let turned = [-0.25, 0.25].iter().all(|t| {
-                let goal = s.base_from_object * grasp_pose(s.grasp_turn_rad + t, 0.0);
-                path.last().is_some_and(|last| {
-                    straight_path(s.model, &s.true_dh, &flange_from_gripper, &[goal], last).is_some()
-                })
+            // The plan may turn the gripper otherwise about the axis, since visibility is flat there: those ways must be open too.
+            let turned = [-0.7, -0.35, 0.35, 0.7].iter().all(|t| {
+                let turn = s.grasp_turn_rad + t;
+                let mut way = line(&start, &grasp_pose(turn, STANDOFF_M), 16);
+                way.extend(line(&grasp_pose(turn, STANDOFF_M), &grasp_pose(turn, 0.0), 5).into_iter().skip(1));
+                let way: Vec<Pose> = way.iter().map(|p| s.base_from_object * p).collect();
+                path.first()
+                    .is_some_and(|q| straight_path(s.model, &s.true_dh, &flange_from_gripper, &way, q).is_some())
             });
             if turned {
                 return path.first().copied();
@@ -298,7 +301,7 @@ fn draw_start(s: &Scenario, body: &Body, rng: &mut ChaCha8Rng) -> Option<Joints>
 }
 
 /// The same configuration with every angle within half a turn.
-fn settled(_model: Model, q: Joints) -> Joints {
+fn settled(q: Joints) -> Joints {
     q.map(|v| v - TAU * (v / TAU).round())
 }
 

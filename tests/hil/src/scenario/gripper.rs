@@ -20,7 +20,7 @@ pub fn default_gripper() -> GripperFile {
     let plate = |x: f64, y: f64, z: f64| {
         Isometry3::from_parts(Translation3::new(x, y, z), UnitQuaternion::from_euler_angles(LEAN, 0.0, 0.0))
     };
-    let wings = [plate(0.086, 0.050, -0.075), plate(-0.086, 0.050, -0.075)];
+    let wings = [plate(0.094, 0.050, -0.075), plate(-0.094, 0.050, -0.075)];
     let tongue = plate(0.0, 0.055, -0.040);
     let mut gripper = Gripper { marks: Default::default(), flange_from_gripper: Pose::translation(0.0, 0.0, 0.165) };
     let mut put = |p: &Pose, spots: &[(f64, f64)]| {
@@ -39,12 +39,12 @@ pub fn default_gripper() -> GripperFile {
     GripperFile {
         gripper,
         name: Some("simulated parallel gripper, three mark plates".into()),
-        opening: [0.0, 0.140],
+        opening: [0.0, 0.170],
         finger_length: 0.050,
         fingers: vec![finger(1.0), finger(-1.0)],
         body: vec![
             solid(at(0.0, 0.0, -0.1205), 0.045, 0.032, 0.0425),
-            solid(at(0.0, 0.0, -0.067), 0.090, 0.014, 0.010),
+            solid(at(0.0, 0.0, -0.067), 0.104, 0.014, 0.010),
             solid(wings[0], 0.029, 0.045, THIN),
             solid(wings[1], 0.029, 0.045, THIN),
             solid(tongue, 0.031, 0.020, THIN),

@@ -74,30 +74,37 @@ impl Wheel {
 
     /// Signed distance to the valve (a lower bound of it), metres, and the nearest part.
     pub fn distance(&self, p: &Vec3) -> (f64, Part) {
+        // Plain roots: a careful hypotenuse costs more than everything else here.
+        let length = |a: f64, b: f64| (a * a + b * b).sqrt();
         let (rc, rb) = (self.core_radius_m, self.bar_radius_m);
         let z = p.z - self.core_z();
-        let rho = p.x.hypot(p.y);
-        let rim = (rho - rc).hypot(z) - rb;
-        let mut best = (rim, Part::Rim);
+        let rho = length(p.x, p.y);
+        let mut best = (length(rho - rc, z) - rb, Part::Rim);
         let mut take = |d: f64, part: Part| {
             if d < best.0 {
                 best = (d, part);
             }
         };
-        if self.spokes > 0 {
-            let step = std::f64::consts::TAU / f64::from(self.spokes);
-            let a = p.y.atan2(p.x) - self.spoke_angle_rad;
-            let a = a - step * (a / step).round();
-            let (along, across) = (rho * a.cos(), rho * a.sin());
-            let beyond = (along - rc).max(-along).max(0.0);
-            take((across.hypot(z + 0.25 * rb)).hypot(beyond) - self.spoke_radius(), Part::Spoke);
-        }
         let cylinder = |r: f64, z0: f64, z1: f64| {
             let (dr, dz) = (rho - r, (z0 - z).max(z - z1));
-            dr.max(dz).min(0.0) + dr.max(0.0).hypot(dz.max(0.0))
+            dr.max(dz).min(0.0) + length(dr.max(0.0), dz.max(0.0))
         };
         take(cylinder(self.hub_radius(), -1.6 * rb, 0.5 * rb), Part::Hub);
         take(cylinder(0.45 * self.hub_radius(), -self.stem_m, 0.9 * rb), Part::Hub);
+        // The angle to the nearest spoke only where a spoke could be nearer than what was found.
+        let height = z + 0.25 * rb;
+        let least = length(height, (rho - rc).max(0.0)) - self.spoke_radius();
+        if self.spokes > 0 && least < best.0 {
+            let step = std::f64::consts::TAU / f64::from(self.spokes);
+            let a = p.y.atan2(p.x) - self.spoke_angle_rad;
+            let (sin, cos) = (a - step * (a / step).round()).sin_cos();
+            let (along, across) = (rho * cos, rho * sin);
+            let beyond = (along - rc).max(-along).max(0.0);
+            let d = length(length(across, height), beyond) - self.spoke_radius();
+            if d < best.0 {
+                best = (d, Part::Spoke);
+            }
+        }
         best
     }
 
