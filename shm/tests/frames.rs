@@ -1,4 +1,5 @@
 //! The frame topic between a publisher and a subscriber: order, loss, lies, restarts.
+#![allow(clippy::unwrap_used)]
 
 mod common;
 
@@ -132,18 +133,20 @@ fn random_headers_never_get_past_the_payload() {
         let payload = vec![0u8; len];
         // Some fields right, the rest noise, so that every check is reached.
         let small = |w: u64| (w % 80) as u32;
-        let mut h = StereoHeader::default();
-        h.sequence = words[0];
-        h.sequence_end = if keep & 1 == 0 { words[0] } else { words[1] };
-        h.width = if keep & 2 == 0 { small(words[2]) } else { words[2] as u32 };
-        h.height = if keep & 4 == 0 { small(words[3]) } else { words[3] as u32 };
-        h.stride = if keep & 8 == 0 { small(words[4]) } else { words[4] as u32 };
-        h.pixel_format = if keep & 16 == 0 { small(words[5]) % 10 } else { words[5] as u32 };
+        let mut h = StereoHeader {
+            sequence: words[0],
+            sequence_end: if keep & 1 == 0 { words[0] } else { words[1] },
+            width: if keep & 2 == 0 { small(words[2]) } else { words[2] as u32 },
+            height: if keep & 4 == 0 { small(words[3]) } else { words[3] as u32 },
+            stride: if keep & 8 == 0 { small(words[4]) } else { words[4] as u32 },
+            pixel_format: if keep & 16 == 0 { small(words[5]) % 10 } else { words[5] as u32 },
+            capture_ns: [1_000_000_000; 2],
+            ..Default::default()
+        };
         for e in 0..2 {
             h.offset[e] = if keep & (32 << e) == 0 { words[6 + e] % 4000 } else { words[6 + e] };
             h.size[e] = if keep & (128 << e) == 0 { words[8 + e] % 4000 } else { words[8 + e] };
         }
-        h.capture_ns = [1_000_000_000; 2];
         if let Ok(f) = check(&h, &payload, &FramePolicy::default(), 1_000_000_000) {
             let need = f.stride() * (f.height() - 1) + f.format().row_bytes(f.width() as u32) as usize;
             let mut grey = vec![0; f.width() * f.height()];

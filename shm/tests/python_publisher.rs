@@ -1,4 +1,5 @@
 //! The documented layout, proved by a publisher in another language: `python/publish_stereo.py` in a fresh virtual environment.
+#![allow(clippy::unwrap_used)]
 
 mod common;
 

@@ -1,5 +1,5 @@
 //! A private root folder and prefix for each test, and the clock.
-#![allow(dead_code, unreachable_pub)]
+#![allow(dead_code, unreachable_pub, clippy::unwrap_used)]
 
 use graspd_shm::{Names, ShmNode, create_node};
 use std::sync::atomic::{AtomicU32, Ordering};

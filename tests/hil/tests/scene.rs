@@ -1,4 +1,5 @@
 //! The scene's pictures against its truth: drawn cells are usable, discs and circles lie where projection says, depth decides.
+#![allow(clippy::unwrap_used)]
 
 use graspd_hil::scenario::{Options, STANDOFF_M, Scenario, seen_marks};
 use graspd_hil::scene::{Body, Noise, Sensor, Snapshot, StereoRenderer, ViewRenderer};

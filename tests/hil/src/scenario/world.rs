@@ -33,7 +33,13 @@ pub enum WorldError {
     },
     /// The rig or the gripper file is refused.
     #[error(transparent)]
-    Calibration(#[from] FileError),
+    Calibration(Box<FileError>),
+}
+
+impl From<FileError> for WorldError {
+    fn from(e: FileError) -> Self {
+        Self::Calibration(Box::new(e))
+    }
 }
 
 #[derive(Serialize, Deserialize)]

@@ -87,7 +87,7 @@ impl Body {
     pub fn hides(&self, centre: &Vec3, point: &Vec3, opening: f64) -> bool {
         self.solids.iter().any(|s| {
             let shift = Vec3::new(0.5 * s.slide * opening, 0.0, 0.0);
-            s.enter(&(centre - shift), &(point - shift)).is_some_and(|t| t < 1.0 - 1e-3 && t >= 0.0)
+            s.enter(&(centre - shift), &(point - shift)).is_some_and(|t| (0.0..1.0 - 1e-3).contains(&t))
         })
     }
 

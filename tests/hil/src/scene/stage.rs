@@ -93,7 +93,7 @@ impl Stage {
         let p = o + d * t;
         let n = Vec3::z();
         for b in &self.bolts_m {
-            if (p.x - b[0]).hypot(p.y - b[1]) < b[2].abs() {
+            if (p.x - b[0]).powi(2) + (p.y - b[1]).powi(2) < b[2] * b[2] {
                 return (self.shade(if b[2] > 0.0 { 0.09 } else { 0.85 }, &n, self.lit(&p)), Thing::Bolt);
             }
         }
@@ -129,12 +129,13 @@ impl Stage {
         }
         let end = along + (b * b - miss2).sqrt();
         let mut lit = 1.0f64;
+        let core_z = self.wheel.core_z();
         let mut t = (along - (b * b - miss2).sqrt()).max(1e-3);
         for _ in 0..48 {
             if t >= end {
                 break;
             }
-            let (s, _) = self.wheel.distance(&(p + l * t));
+            let (s, _) = self.wheel.distance_above(&(p + l * t), core_z);
             if s < 1e-5 {
                 return 0.0;
             }

@@ -74,10 +74,15 @@ impl Wheel {
 
     /// Signed distance to the valve (a lower bound of it), metres, and the nearest part.
     pub fn distance(&self, p: &Vec3) -> (f64, Part) {
+        self.distance_above(p, self.core_z())
+    }
+
+    /// [`Self::distance`] with the core circle's height computed once for a whole ray.
+    pub(super) fn distance_above(&self, p: &Vec3, core_z: f64) -> (f64, Part) {
         // Plain roots: a careful hypotenuse costs more than everything else here.
         let length = |a: f64, b: f64| (a * a + b * b).sqrt();
         let (rc, rb) = (self.core_radius_m, self.bar_radius_m);
-        let z = p.z - self.core_z();
+        let z = p.z - core_z;
         let rho = length(p.x, p.y);
         let mut best = (length(rho - rc, z) - rb, Part::Rim);
         let mut take = |d: f64, part: Part| {
@@ -125,14 +130,15 @@ impl Wheel {
         let half = (b * b - miss2).sqrt();
         let (mut t, end) = ((along - half).max(0.0), along + half);
         let cover = self.trace_cover(o, d);
+        let core_z = self.core_z();
         for _ in 0..128 {
             let p = o + d * t;
-            let (s, part) = self.distance(&p);
+            let (s, part) = self.distance_above(&p, core_z);
             if s < 2e-6 {
                 if let Some(c) = cover.filter(|c| *c < t) {
                     return Some((c, Part::Cover, Vec3::new(0.0, 0.0, 1.0)));
                 }
-                let n = self.normal(&p);
+                let n = self.normal(&p, core_z);
                 let part = if part == Part::Rim && self.is_painted(&p) { Part::Paint } else { part };
                 return Some((t, part, n));
             }
@@ -153,13 +159,13 @@ impl Wheel {
         v.abs() < self.paint_half_angle()
     }
 
-    fn normal(&self, p: &Vec3) -> Vec3 {
+    fn normal(&self, p: &Vec3, core_z: f64) -> Vec3 {
         let h = 1e-6;
         let mut n = Vec3::zeros();
         for k in 0..3 {
             let mut e = Vec3::zeros();
             e[k] = h;
-            n[k] = self.distance(&(p + e)).0 - self.distance(&(p - e)).0;
+            n[k] = self.distance_above(&(p + e), core_z).0 - self.distance_above(&(p - e), core_z).0;
         }
         n.try_normalize(0.0).unwrap_or_else(Vec3::z)
     }

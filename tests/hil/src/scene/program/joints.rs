@@ -79,7 +79,7 @@ impl Arm {
     pub(super) fn at(&self, t_ns: u64) -> Option<Sample> {
         let h = self.lock();
         let after = h.samples.partition_point(|s| s.at_ns <= t_ns);
-        let (a, b) = (h.samples.get(after.checked_sub(1).unwrap_or(0))?, h.samples.get(after));
+        let (a, b) = (h.samples.get(after.saturating_sub(1))?, h.samples.get(after));
         let Some(b) = b.filter(|b| b.at_ns > a.at_ns && a.at_ns <= t_ns) else { return Some(*a) };
         // A gap in the stream is a hold, not a slow glide.
         if b.at_ns - a.at_ns > 50_000_000 {
