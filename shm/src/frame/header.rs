@@ -50,7 +50,7 @@ pub struct StereoHeader {
     pub flags: u32,
     /// [`id_hash`] of each camera's serial number; 0 means unknown.
     pub camera_id: [u64; 2],
-    /// [`id_hash`] of the calibration the publisher believes in; 0 means unknown.
+    /// Identity of the calibration the publisher believes in (the rig file's content hash, first eight bytes); 0 means unknown.
     pub calibration_id: u64,
     /// Pairs the publisher itself had to drop since it started.
     pub dropped: u64,
@@ -117,7 +117,7 @@ impl Default for StereoHeader {
     }
 }
 
-/// Hash that turns a camera's serial number or a calibration's identity into a header field: FNV-1a, 64 bits, never 0.
+/// Hash that turns a camera's serial number into a header field: FNV-1a, 64 bits, never 0.
 pub const fn id_hash(text: &str) -> u64 {
     let bytes = text.as_bytes();
     let mut h: u64 = 0xcbf2_9ce4_8422_2325;

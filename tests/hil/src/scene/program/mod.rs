@@ -128,7 +128,7 @@ fn run(args: &Args) -> Result<(), SceneError> {
         arm.follow(address.clone(), Arc::clone(&stop));
     }
     // A real camera takes no time from the controller's processor; a simulated one steps back.
-    let _ = rustix::process::nice(5);
+    let _ = rustix::process::nice(2);
     let renderer = scenario.renderer();
     let node = create_node(&names, "graspd-scene")?;
     let seed = scenario.seed;
