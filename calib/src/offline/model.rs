@@ -111,6 +111,9 @@ pub struct Options {
     pub gate_sigmas: f64,
     /// Allowance for the rig's calibration error in the two-view test, pixels (0: trust the rig fully). A real rig needs 0.3 to 1.
     pub calibration_px: f64,
+    /// Systematic error that edge points share along a contour, pixels (0: none, as for points without a picture). Detected edges
+    /// have 0.05 to 0.1; an ellipse that it could have made of a circle is taken for a circle.
+    pub edge_bias_px: f64,
     /// Largest residual standard deviation that edge points may show, pixels.
     pub max_noise_px: f64,
     /// Smallest acceptable semi-minor axis of a rim's picture, pixels (errata C1).
@@ -131,6 +134,7 @@ impl Default for Options {
             robust: true,
             gate_sigmas: 4.0,
             calibration_px: 0.0,
+            edge_bias_px: 0.0,
             max_noise_px: 3.0,
             min_minor_axis_px: 3.0,
             max_sigma_centre: None,

@@ -32,7 +32,10 @@ pub struct PlanOptions {
 impl Default for PlanOptions {
     /// A real rig's calibration is good to a fraction of a pixel, and the edges' own noise is a lower bound of the doubt.
     fn default() -> Self {
-        Self { rim: model::Options { calibration_px: 0.5, ..model::Options::default() }, approach: Approach::default() }
+        Self {
+            rim: model::Options { calibration_px: 0.5, edge_bias_px: 0.1, ..model::Options::default() },
+            approach: Approach::default(),
+        }
     }
 }
 

@@ -143,14 +143,23 @@ pub fn choose_plane_model(a: &Analysis, rim: RimChoice, options: &Options) -> Re
     let circle = a.circle.as_ref();
     // The noise that the richer model leaves is the yardstick for both.
     let noise = ellipse.or(circle).map_or(1.0, |f| noise_of(f, a, options));
-    let scores: Vec<Score> =
+    let mut scores: Vec<Score> =
         [circle, ellipse].into_iter().flatten().map(|f| score(f.model, f.chi2, f.parameters, f.count, noise)).collect();
     let fit = match (rim, circle, ellipse) {
         (RimChoice::Circle, c, _) => c.map_err(Clone::clone)?,
         (RimChoice::Ellipse, _, e) => e.map_err(Clone::clone)?,
         (_, Ok(c), Ok(e)) => {
             let bic = |m| scores.iter().find(|s| s.model == m).map_or(f64::INFINITY, |s| s.bic);
-            if bic(RimModel::Circle) <= bic(RimModel::Ellipse) { c } else { e }
+            if bic(RimModel::Circle) <= bic(RimModel::Ellipse) {
+                c
+            } else if round_within_bias(e, a, options) {
+                for s in scores.iter_mut().filter(|s| s.model == RimModel::Ellipse) {
+                    s.excluded = Some("a circle within the edges' systematic error");
+                }
+                c
+            } else {
+                e
+            }
         }
         (_, Ok(c), Err(_)) => c,
         (_, Err(_), e) => e.map_err(Clone::clone)?,
@@ -165,6 +174,13 @@ pub fn choose_plane_model(a: &Analysis, rim: RimChoice, options: &Options) -> Re
         options,
     )?;
     Ok((fit.clone(), scores))
+}
+
+/// Whether an ellipse is so nearly round that the edges' systematic error alone could have made it (errata D: a circle when `1 - b/a`
+/// is within three standard deviations of zero; detected edges carry an error that does not average out over their number).
+fn round_within_bias(e: &MlFit, a: &Analysis, options: &Options) -> bool {
+    let radius = a.fits.iter().map(|f| f.fit.ellipse.a).fold(f64::INFINITY, f64::min);
+    1.0 - e.rim.b / e.rim.a <= 3.0 * options.edge_bias_px / radius
 }
 
 /// Bayesian information criterion of a model for a given noise.

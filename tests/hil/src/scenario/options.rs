@@ -52,7 +52,7 @@ impl Default for Options {
             rim_occlusion: 0.0,
             core_radius_m: [0.056, 0.064],
             bar_radius_m: [0.012, 0.0135],
-            paint_width_m: 0.005,
+            paint_width_m: 0.007,
             tilt_deg: [18.0, 33.0],
             distance_m: 1.5,
             baseline_m: 0.5,
