@@ -151,14 +151,14 @@ pub struct PlanArgs {
     /// With --auto: plan for this proposal
     #[arg(long, value_name = "N", requires = "auto")]
     pub pick: Option<usize>,
-    /// Rim model: auto, circle, ellipse, round-bar
+    /// Rim model: auto, edge, circle, ellipse, round-bar
     #[arg(long, default_value = "auto")]
     pub rim: String,
     /// Bar diameter in metres, where the operator knows it (round-bar rims)
     #[arg(long, value_name = "M")]
     pub bar_diameter: Option<f64>,
     /// Distance of the pre-grasp pose from the object's plane, metres
-    #[arg(long, value_name = "M", default_value_t = 0.10)]
+    #[arg(long, value_name = "M", default_value_t = 0.12)]
     pub pregrasp: f64,
     /// Distance of the grasp pose from the object's plane, metres
     #[arg(long, value_name = "M", default_value_t = 0.0, allow_hyphen_values = true)]
@@ -169,6 +169,9 @@ pub struct PlanArgs {
     /// Uncertainty of the normal that the task tolerates (one sigma), degrees
     #[arg(long, value_name = "DEG", default_value_t = 0.5)]
     pub tolerance_deg: f64,
+    /// Allowance for the rig's calibration error in the two-view test, pixels
+    #[arg(long, value_name = "PX")]
+    pub calibration_px: Option<f64>,
     /// Where to write the plan
     #[arg(long, value_name = "plan.toml")]
     pub out: Option<PathBuf>,

@@ -127,11 +127,17 @@ impl Default for WatchSettings {
 }
 
 impl WatchSettings {
-    /// For a host without real-time scheduling: missed beats are counted and hold nothing, and robot state and the loop itself
-    /// may be twice as late. The robot-side watchdog of 50 ms stays what it is.
+    /// For a host without real-time scheduling: missed beats are counted and hold nothing, and robot state, pictures and the
+    /// loop itself may be twice as late. The robot-side watchdog of 50 ms stays what it is.
     pub fn best_effort() -> Self {
         let d = Self::default();
-        Self { overruns_per_s: 0, stall_ns: 2 * d.stall_ns, state_age_ns: 2 * d.state_age_ns, ..d }
+        Self {
+            overruns_per_s: 0,
+            stall_ns: 2 * d.stall_ns,
+            state_age_ns: 2 * d.state_age_ns,
+            frame_age_ns: 2 * d.frame_age_ns,
+            ..d
+        }
     }
 }
 

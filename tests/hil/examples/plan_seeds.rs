@@ -1,11 +1,11 @@
 //! Plans on the first pictures of many random cells and compares with the truth: `plan_seeds FIRST COUNT [occlusion]`.
 
+use graspd_calib::files::RigFile;
 use graspd_calib::offline::picture::Picture;
 use graspd_calib::offline::plan::{PlanOptions, plan};
 use graspd_calib::offline::select::Selection;
-use graspd_calib::files::RigFile;
-use graspd_rt::geom::View;
 use graspd_hil::scenario::{Options, Scenario};
+use graspd_rt::geom::View;
 
 fn main() {
     let args: Vec<f64> = std::env::args().skip(1).filter_map(|a| a.parse().ok()).collect();

@@ -196,9 +196,11 @@ impl Say {
             return;
         }
         let get = |key: &str| plan.pointer(key).and_then(serde_json::Value::as_f64);
-        if let (Some(a), Some(c), Some(n)) =
-            (get("/object/semi_axes_m/0"), get("/object/sigma_centre_mm"), get("/object/sigma_normal_deg"))
-        {
+        if let (Some(a), Some(c), Some(n)) = (
+            get("/plan/object/semi_axes_m/0"),
+            get("/plan/object/sigma_centre_mm"),
+            get("/plan/object/sigma_normal_deg"),
+        ) {
             println!("          rim of radius {:.1} mm, centre known to {c:.2} mm, axis to {n:.2} degrees", a * 1e3);
         }
     }
