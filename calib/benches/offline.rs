@@ -1,4 +1,5 @@
 //! Time of the off-line stage's mathematics: `cargo bench -p graspd-calib --bench offline`. Prints; never judges.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::offline::circle::extract;
 use graspd_calib::offline::cone::{ConePair, project};

@@ -1,4 +1,5 @@
 //! Prints the accuracy study's table: `cargo run --release -p graspd-calib --example study [trials] [seed]`.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 fn main() {
     let mut arguments = std::env::args().skip(1).filter_map(|a| a.parse::<u64>().ok());

@@ -1,4 +1,5 @@
 //! Wrong and absurd selections: none gives a wrong answer that passes more often than 1 in 1,000, none panics; and right ones pass.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::offline::cone::project;
 use graspd_calib::offline::model::{EdgePoint, Options, Projection, Rim, RimChoice};

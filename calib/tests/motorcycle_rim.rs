@@ -1,4 +1,5 @@
 //! One click a view on the front rim of the real motorcycle pair, against the ground truth and the reference's own figures.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::{GripperFile, RigFile};
 use graspd_calib::offline::picture::Picture;

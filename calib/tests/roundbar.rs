@@ -1,4 +1,5 @@
 //! Round-bar rims: a simulated torus wheel, its outlines in both views with noise.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::offline::cone::{camera_centre, project};
 use graspd_calib::offline::model::{EdgePoint, Options, Projection, RimChoice, RimModel};

@@ -3,6 +3,7 @@
 //! Two loops in the same run, alternating, with the same system calls in the same order (poll, read until it would block,
 //! QUICKACK, write): one moves bytes only, the other is the whole link, framing, session, decoding, gap count and encoding.
 //! The peer is a thread that sends a state every 2 ms; processor time is that of the measured thread alone.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};

@@ -1,4 +1,5 @@
 //! Bad input: one clear error that names file, key and fix, the documented exit code, and nothing written or moved.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

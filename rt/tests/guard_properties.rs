@@ -1,4 +1,5 @@
 //! The guard under arbitrary input: nothing that goes out breaks a limit, whatever comes in.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_rt::arm::{Dh, Joints, Model, READY};
 use graspd_rt::geom::Pose;

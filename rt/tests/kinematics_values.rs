@@ -1,6 +1,7 @@
 //! Values only: the arm's poses and Jacobians against numbers from an independent library.
 //!
 //! `data/kinematics_pin.csv` was made by `data/make_kinematics.py` with Pinocchio; see there for the columns.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_rt::arm::{Dh, Joints, Model};
 use graspd_rt::geom::Pose;

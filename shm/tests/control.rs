@@ -1,4 +1,5 @@
 //! Telemetry and requests between a daemon and its clients.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod common;
 

@@ -1,4 +1,5 @@
 //! Plans on the first pictures of many random cells and compares with the truth: `plan_seeds FIRST COUNT [occlusion]`.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::RigFile;
 use graspd_calib::offline::picture::Picture;

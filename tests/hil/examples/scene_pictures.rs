@@ -1,4 +1,5 @@
 //! Draws a scenario's first pictures: `cargo run --release -p graspd-hil --example scene_pictures -- SEED FOLDER`.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::scenario::{Options, Scenario};
 use graspd_rt::geom::View;

@@ -1,4 +1,5 @@
 //! The daemon's own control script under the interpreter: handshake, rates, refusals, a beat that stands still.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod desk;
 

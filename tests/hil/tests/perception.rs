@@ -1,5 +1,6 @@
 //! The tracker against the simulated cell's own pictures, whose truth it is not told: acquisition at the start and before the
 //! valve, then tracking along the way.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::scenario::{Options, STANDOFF_M, Scenario};
 use graspd_hil::scene::Snapshot;

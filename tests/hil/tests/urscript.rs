@@ -1,4 +1,5 @@
 //! Programs on a scripted host: language, threads, motion, bounds.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod desk;
 
