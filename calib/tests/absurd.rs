@@ -136,7 +136,11 @@ fn no_input_whatever_panics() {
     let odd = [0.0, -0.0, 1.0, f64::NAN, f64::INFINITY, -f64::INFINITY, 1e308, -1e308, 1e-308, 5e-324, 1e150, 640.0];
     for i in 0..3000 {
         let mut pick = |usual: f64| {
-            if r.bits() % 6 == 0 { odd[(r.bits() % odd.len() as u64) as usize] } else { usual + r.uniform(-50.0, 50.0) }
+            if r.bits().is_multiple_of(6) {
+                odd[(r.bits() % odd.len() as u64) as usize]
+            } else {
+                usual + r.uniform(-50.0, 50.0)
+            }
         };
         let mut list = |n: usize| -> Vec<EdgePoint> {
             (0..n)

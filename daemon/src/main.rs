@@ -47,8 +47,8 @@ fn run(command: Command) -> Result<Exit, Failure> {
         Command::Reconstruct(args) => cli::reconstruct(&args),
         Command::Study(args) => cli::study(&args),
         #[cfg(feature = "demo")]
-        Command::MockUr(p) => Ok(cli::world(|a| graspd_hil::controller::main_with_args(a), "graspd-mock-ur", &p.args)),
+        Command::MockUr(p) => Ok(cli::world(graspd_hil::controller::main_with_args, "graspd-mock-ur", &p.args)),
         #[cfg(feature = "demo")]
-        Command::Scene(p) => Ok(cli::world(|a| graspd_hil::scene::main_with_args(a), "graspd-scene", &p.args)),
+        Command::Scene(p) => Ok(cli::world(graspd_hil::scene::main_with_args, "graspd-scene", &p.args)),
     }
 }

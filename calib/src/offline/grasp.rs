@@ -309,7 +309,7 @@ impl Finder<'_> {
         let marks = self.gripper.gripper.marks.len();
         let value = |p: &Place| {
             let both = p.worth(0) > 0.0 && p.worth(1) > 0.0;
-            let all = p.seen.iter().any(|n| *n == marks);
+            let all = p.seen.contains(&marks);
             (both, all, p.worth(0).max(p.worth(1)))
         };
         places.sort_by(|(p, x), (q, y)| {

@@ -166,7 +166,7 @@ mod tests {
         }
         assert!((four[1].pose.rotation * Vector3::x() - rim.axis_b).norm() < 1e-12);
         // The jaw opens 140 mm: enough for the minor axis, not for the major one.
-        assert_eq!(four.map(|g| g.feasible[0] || g.feasible[1])[0], false);
+        assert!(!four.map(|g| g.feasible[0] || g.feasible[1])[0]);
         assert!((four[0].opening - 0.15).abs() < 1e-12);
     }
 

@@ -22,7 +22,7 @@ pub enum Command {
     /// Run the whole chain against a simulated robot and simulated cameras, as separate processes
     Demo(DemoArgs),
     /// Off line: from one click in each picture to a set-point (plan.toml) and an overlay
-    Plan(PlanArgs),
+    Plan(Box<PlanArgs>),
     /// On line: the real-time daemon; frames in, robot commands out
     Run(RunArgs),
     /// What the daemon is doing
