@@ -1,6 +1,6 @@
 //! The UR link and the control script against the mock controller, over loopback TCP: identity, upload, motion, a beat that
 //! stops, a protective stop and the way back. Every wait is bounded.
-#![allow(clippy::unwrap_used)] // a helper that fails is a test that fails
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 #![cfg(feature = "demo")]
 
 use std::net::{IpAddr, Ipv4Addr};

@@ -1,5 +1,5 @@
 //! The UR link against peers that misbehave, over loopback TCP. Every wait is bounded; no time is asserted from below.
-#![allow(clippy::unwrap_used)] // a helper that fails is a test that fails
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};

@@ -2,7 +2,7 @@
 //! machine the best is the program's, the rest the neighbours').
 //!
 //! `cargo bench -p graspd-rt --bench perception`. Figures, not a test: nothing fails here for being slow.
-#![allow(clippy::unwrap_used, missing_docs)]
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 #[path = "../tests/support/mod.rs"]
 mod support;

@@ -1,6 +1,6 @@
 //! What a package costs: `cargo bench -p graspd-rt --bench rtde`. Prints the best and the median of many batches, ns each, and
 //! the allocations (none are possible in this crate; the counter proves it for the whole path).
-#![allow(clippy::unwrap_used)] // a helper that fails is a test that fails
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::hint::black_box;

@@ -1,5 +1,5 @@
 //! Acquisition from nothing: random poses among clutter, missing marks, and the cases in which the only right answer is a refusal.
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod support;
 

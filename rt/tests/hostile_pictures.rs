@@ -1,5 +1,5 @@
 //! Whatever the pictures, stamps, poses and rigs are: no panic, no endless loop, and nothing that is not finite.
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod support;
 

@@ -1,5 +1,5 @@
 //! RTDE against literal bytes, against arbitrary bytes, and the client's half against a server's half in memory.
-#![allow(clippy::unwrap_used)] // a helper that fails is a test that fails
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_rt::arm::{ArmCommand, ArmMode};
 use graspd_rt::rtde::*;

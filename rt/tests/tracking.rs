@@ -1,6 +1,5 @@
 //! Tracking against rendered truth: bias and honest covariance of marks and pose, and what happens when the picture lies.
-
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod support;
 

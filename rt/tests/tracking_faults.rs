@@ -1,5 +1,5 @@
 //! Faults of the mark list (M01 to M09) against the tracker: degrade, refuse, stop; never follow.
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod support;
 

@@ -1,5 +1,5 @@
 //! The frame topic between a publisher and a subscriber: order, loss, lies, restarts.
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod common;
 

@@ -1,5 +1,5 @@
 //! The documented layout, proved by a publisher in another language: `python/publish_stereo.py` in a fresh virtual environment.
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod common;
 

@@ -1,5 +1,5 @@
 //! The command cycle in lock step with a simulated arm and rig: does it arrive, and does it always stop?
-#![allow(clippy::unwrap_used)] // helpers of tests
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod world;
 

@@ -1,5 +1,5 @@
 //! The robot on a virtual clock: the daemon's own control script, its watchdog, every stop, and the RTDE half byte for byte.
-#![allow(clippy::unwrap_used, reason = "a test stops where it fails")]
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command, RobotMode, Rule, RuntimeState, SafetyMode, Setup, Upload};
 use graspd_hil::mock_arm::{MockArm, PeerError};

@@ -1,5 +1,5 @@
 //! The mock controller over real sockets: hostile clients, slow ones, a thousand of them, and one that dies in motion.
-#![allow(clippy::unwrap_used, reason = "a test stops where it fails")]
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command, Entry, Hosted, Setup, judge_record, now_ns, read_record};
 use graspd_hil::plant::Model;

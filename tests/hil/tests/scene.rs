@@ -1,5 +1,5 @@
 //! The scene's pictures against its truth: drawn cells are usable, discs and circles lie where projection says, depth decides.
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::scenario::{Options, STANDOFF_M, Scenario, seen_marks};
 use graspd_hil::scene::{Body, Noise, Sensor, Snapshot, StereoRenderer, ViewRenderer};

@@ -1,5 +1,5 @@
 //! `graspd-scene` as a process: frames over shared memory, the truth over a pipe, faults on command, an end with its parent.
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::scenario::{Options, Scenario};
 use graspd_shm::frame::{FramePolicy, FrameSubscriber, Reject, id_hash};

@@ -1,5 +1,5 @@
 //! Other people's clients against the mock controller: SDU's ur_rtde wheel as published, and a plain Python client.
-#![allow(clippy::unwrap_used, reason = "a test stops where it fails")]
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command as Order, Hosted, Setup};
 use graspd_hil::plant::Model;
