@@ -162,7 +162,7 @@ fn verbs_without_a_daemon_end_with_the_link_code() {
         refused(&[verb, "--cell", "nobody", "--shm-root", &root, "--timeout", "0.2"], 4, &["no daemon"]);
     }
     refused(&["setpoint", "nowhere.toml", "--cell", "nobody", "--shm-root", &root], 3, &["nowhere.toml"]);
-    refused(&["status", "--timeout", "-1"], 2, &["--timeout"]);
+    refused(&["status", "--timeout=-1"], 2, &["--timeout"]);
     refused(&["dance"], 2, &["dance"]);
 }
 

@@ -33,7 +33,7 @@ impl Default for PlanOptions {
     /// A real rig's calibration is good to a fraction of a pixel, and the edges' own noise is a lower bound of the doubt.
     fn default() -> Self {
         Self {
-            rim: model::Options { calibration_px: 0.5, edge_bias_px: 0.1, ..model::Options::default() },
+            rim: model::Options { calibration_px: 1.0, edge_bias_px: 0.1, ..model::Options::default() },
             approach: Approach::default(),
         }
     }

@@ -39,7 +39,7 @@ pub struct Args {
     /// Joint positions at the start, rad
     #[arg(long, value_parser = numbers::<6>, value_name = "Q1,..,Q6", allow_hyphen_values = true)]
     pub start_joints: Option<[f64; 6]>,
-    /// The unit's own DH parameters: TOML with a [dh] table of a, d, alpha, theta
+    /// The unit's own DH parameters: TOML with a table dh of a, d, alpha, theta
     #[arg(long, value_name = "FILE")]
     pub kinematics: Option<PathBuf>,
     /// Control steps a second; the model's own unless given

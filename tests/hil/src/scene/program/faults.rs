@@ -7,36 +7,36 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "fault", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Fault {
-    /// Same picture again and again while stamps and sequence go on [C03]; `eye` 0 left, 1 right, both without.
+    /// Same picture again and again while stamps and sequence go on (C03); `eye` 0 left, 1 right, both without.
     Freeze {
         /// Which eye.
         #[serde(default)]
         eye: Option<usize>,
     },
-    /// One eye's picture and stamp stand still [C01]; without `eye` nothing is published at all [C02].
+    /// One eye's picture and stamp stand still (C01); without `eye` nothing is published at all (C02).
     Stop {
         /// Which eye.
         #[serde(default)]
         eye: Option<usize>,
     },
-    /// The sequence number repeats [C04].
+    /// The sequence number repeats (C04).
     RepeatSequence {},
-    /// The sequence number jumps back by `n` [C04].
+    /// The sequence number jumps back by `n` (C04).
     BackSequence {
         /// How far.
         n: u64,
     },
-    /// Of every `every` pairs one is lost before publishing [C05].
+    /// Of every `every` pairs one is lost before publishing (C05).
     Drop {
         /// Period of the loss.
         every: u64,
     },
-    /// The right eye is exposed earlier by `ms`, and says so [C06].
+    /// The right eye is exposed earlier by `ms`, and says so (C06).
     Skew {
         /// Milliseconds.
         ms: f64,
     },
-    /// Left and right pictures change places; with `ids` the camera ids as well [C07].
+    /// Left and right pictures change places; with `ids` the camera ids as well (C07).
     Swap {
         /// Whether the ids go with the pictures.
         #[serde(default)]
@@ -50,7 +50,7 @@ pub enum Fault {
         /// Its value; for `offset`, `size` and `camera_id` the right eye's.
         value: u64,
     },
-    /// Part of a picture is missing; flagged unless `silent` [C09].
+    /// Part of a picture is missing; flagged unless `silent` (C09).
     Incomplete {
         /// Which eye.
         #[serde(default)]
@@ -59,7 +59,7 @@ pub enum Fault {
         #[serde(default)]
         silent: bool,
     },
-    /// Capture stamps are off by `ms`, positive into the future [C10]; `drift_ppm` lets them run away [C11].
+    /// Capture stamps are off by `ms`, positive into the future (C10); `drift_ppm` lets them run away (C11).
     Stamp {
         /// Constant part, milliseconds.
         #[serde(default)]
@@ -68,7 +68,7 @@ pub enum Fault {
         #[serde(default)]
         drift_ppm: f64,
     },
-    /// Greys are multiplied: 0 is black, 1 as it was, 10 saturated [C12]. `period_s` lets the exposure hunt.
+    /// Greys are multiplied: 0 is black, 1 as it was, 10 saturated (C12). `period_s` lets the exposure hunt.
     Gain {
         /// Factor.
         factor: f64,
@@ -76,7 +76,7 @@ pub enum Fault {
         #[serde(default)]
         period_s: f64,
     },
-    /// Fog: contrast shrinks towards `grey` by `share` [C12].
+    /// Fog: contrast shrinks towards `grey` by `share` (C12).
     Fog {
         /// Share of the fog, 0 to 1.
         share: f64,
@@ -84,12 +84,12 @@ pub enum Fault {
         #[serde(default = "mid_grey")]
         grey: f64,
     },
-    /// Defocus: a box blur of half width `px` [C13].
+    /// Defocus: a box blur of half width `px` (C13).
     Blur {
         /// Half width, pixels.
         px: usize,
     },
-    /// A camera is knocked: moved along x by `mm` and turned about y by `deg` [C14]. Takes a second to show.
+    /// A camera is knocked: moved along x by `mm` and turned about y by `deg` (C14). Takes a second to show.
     KnockCamera {
         /// Which eye.
         #[serde(default)]
@@ -101,12 +101,12 @@ pub enum Fault {
         #[serde(default)]
         deg: f64,
     },
-    /// The valve is moved by `mm` along its x axis after the plan was made [G07]. Takes a second to show.
+    /// The valve is moved by `mm` along its x axis after the plan was made (G07). Takes a second to show.
     MoveObject {
         /// Millimetres.
         mm: f64,
     },
-    /// Another rate [C16].
+    /// Another rate (C16).
     Rate {
         /// Pairs a second.
         hz: f64,
@@ -116,16 +116,16 @@ pub enum Fault {
         /// Which mark, from 0.
         mark: usize,
     },
-    /// Everything of the gripper is hidden [M02].
+    /// Everything of the gripper is hidden (M02).
     HideGripper {},
-    /// Two marks change places in the pictures: each window shows the other's surroundings [M03].
+    /// Two marks change places in the pictures: each window shows the other's surroundings (M03).
     SwapMarks {
         /// One.
         a: usize,
         /// The other.
         b: usize,
     },
-    /// A disc that is no mark, `du`, `dv` pixels from a mark [M04].
+    /// A disc that is no mark, `du`, `dv` pixels from a mark (M04).
     Blob {
         /// Which mark.
         #[serde(default)]
@@ -141,12 +141,12 @@ pub enum Fault {
         #[serde(default)]
         grey: u8,
     },
-    /// The gripper appears elsewhere, by `mm` along its x axis [M05].
+    /// The gripper appears elsewhere, by `mm` along its x axis (M05).
     Teleport {
         /// Millimetres.
         mm: f64,
     },
-    /// One view is shifted by whole pixels [M08].
+    /// One view is shifted by whole pixels (M08).
     Shift {
         /// Which eye.
         #[serde(default)]
@@ -156,11 +156,11 @@ pub enum Fault {
         /// Pixels down.
         dv: i64,
     },
-    /// The gripper's picture stands still while the arm moves; noise goes on [M09].
+    /// The gripper's picture stands still while the arm moves; noise goes on (M09).
     HoldPose {},
-    /// White noise instead of pictures [M07].
+    /// White noise instead of pictures (M07).
     WhiteNoise {},
-    /// A second publisher sends pairs of its own [H06].
+    /// A second publisher sends pairs of its own (H06).
     SecondPublisher {},
 }
 
