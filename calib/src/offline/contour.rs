@@ -5,11 +5,12 @@
 //! they stop changing, then the edges in a narrow band are taken by consensus, thinned to independent ones and refined.
 
 use super::arcs::Arcs;
-use super::edges::{self, EdgeMap};
+use super::edges::{self, EdgeMap, Refined};
 use super::lens::Lens;
 use super::model::{EdgePoint, Ellipse2, Outline};
 use super::picture::Picture;
 use super::quick_fit::{Sums, Walk};
+use super::sharpen::{lens_blur, sharpen};
 use graspd_rt::geom::{Camera, Pixel};
 
 /// Edges closer together than this share most of their pixels (2 sqrt(pi) times the smoothing), so that they count as one.
@@ -341,7 +342,7 @@ impl<'a> ViewEdges<'a> {
     }
 
     fn refined(&self, start: &Ellipse2, sign: f64, band: &[u32], width: f64) -> Option<Contour> {
-        let mut e = *start;
+        let e = *start;
         let w = Walk::new(&e);
         let bins = ((w.perimeter() / INDEPENDENT_PX) as usize).clamp(12, 4000);
         // In each bin the edge nearest its middle, so that the points stand apart.
@@ -380,58 +381,93 @@ impl<'a> ViewEdges<'a> {
             let edge = EdgePoint { uv: ideal, sigma, outline: Outline::Outer };
             points.push(ContourPoint { raw: r.at, edge, residual: 0.0, parameter: t });
         }
-        for round in 0..4 {
-            let w = Walk::new(&e);
-            let mut sums = Sums::new(e.centre, e.a);
-            for p in &mut points {
-                let (d, _, t) = w.measure(p.edge.uv);
-                p.residual = d;
-                p.parameter = t;
+        points_on_one_ellipse(points, e, sign < 0.0, bins, rejected)
+    }
+
+    /// The same contour with every edge told apart from its neighbours (see [`super::sharpen`]); the contour itself where too few can be.
+    pub(super) fn sharpened(&self, c: &Contour) -> Contour {
+        let blur = lens_blur(self.picture, &self.map);
+        let w = Walk::new(&c.ellipse);
+        let sign = if c.bright_inside { -1.0 } else { 1.0 };
+        let mut points = Vec::new();
+        let mut rejected = c.rejected.clone();
+        for p in &c.points {
+            let (_, n, t) = w.measure(p.edge.uv);
+            // The ellipse knows the direction of the edge better than one pixel's gradient does.
+            let ahead = self.lens.raw(p.edge.uv + n * 0.5) - self.lens.raw(p.edge.uv - n * 0.5);
+            let Some(towards_bright) = (ahead * sign).try_normalize(1e-9) else { continue };
+            let start = Refined { at: p.raw, towards_bright, sigma: p.edge.sigma, width: 1.0 };
+            match sharpen(self.picture, &start, self.map.noise(), blur) {
+                Some(r) => {
+                    let r = r.straightened(n, w.radius(t));
+                    let Some(ideal) = self.lens.ideal(r.at) else { continue };
+                    let edge = EdgePoint { uv: ideal, sigma: r.sigma.hypot(FLOOR_PX), outline: Outline::Outer };
+                    points.push(ContourPoint { raw: r.at, edge, residual: 0.0, parameter: t });
+                }
+                None => rejected.push(p.raw),
             }
-            let mut far: Vec<f64> = points.iter().map(|p| p.residual.abs()).collect();
-            far.sort_by(f64::total_cmp);
-            let scale = 1.48 * far.get(far.len() / 2).copied()?;
-            if round == 2 {
-                let limit = (4.0 * scale).max(0.15);
-                points.retain(|p| {
-                    let ok = p.residual.abs() <= limit;
-                    if !ok {
-                        rejected.push(p.raw);
-                    }
-                    ok
-                });
-            }
-            let c = (5.0 * scale).max(0.2);
-            for p in points.iter().filter(|p| p.residual.abs() < c) {
-                let (st, ct) = p.parameter.sin_cos();
-                let slope2 = (ct / e.a).powi(2) + (st / e.b).powi(2);
-                sums.add(p.edge.uv, (1.0 - (p.residual / c).powi(2)).powi(2) / slope2);
-            }
-            if points.len() < 12 {
-                return None;
-            }
-            e = sums.ellipse()?;
         }
+        if points.len() * 2 < c.points.len() {
+            return c.clone();
+        }
+        let bins = ((w.perimeter() / INDEPENDENT_PX) as usize).clamp(12, 4000);
+        points_on_one_ellipse(points, c.ellipse, c.bright_inside, bins, rejected).unwrap_or_else(|| c.clone())
+    }
+}
+
+/// Fits the ellipse to refined points, drops those that do not lie on it, and puts the rest in order.
+fn points_on_one_ellipse(
+    mut points: Vec<ContourPoint>,
+    mut e: Ellipse2,
+    bright_inside: bool,
+    bins: usize,
+    mut rejected: Vec<Pixel>,
+) -> Option<Contour> {
+    for round in 0..4 {
         let w = Walk::new(&e);
+        let mut sums = Sums::new(e.centre, e.a);
         for p in &mut points {
             let (d, _, t) = w.measure(p.edge.uv);
             p.residual = d;
             p.parameter = t;
         }
-        points.sort_by(|a, b| a.parameter.total_cmp(&b.parameter));
-        let n = points.len() as f64;
-        let rms_px = (points.iter().map(|p| p.residual * p.residual).sum::<f64>() / n).sqrt();
-        let coverage = (n / bins as f64).min(1.0);
-        rejected.sort_by(|a, b| a.y.total_cmp(&b.y).then(a.x.total_cmp(&b.x)));
-        (coverage >= LEAST_COVERAGE && rms_px <= MOST_SCATTER_PX).then_some(Contour {
-            ellipse: e,
-            bright_inside: sign < 0.0,
-            points,
-            rejected,
-            coverage,
-            rms_px,
-        })
+        let mut far: Vec<f64> = points.iter().map(|p| p.residual.abs()).collect();
+        far.sort_by(f64::total_cmp);
+        let scale = 1.48 * far.get(far.len() / 2).copied()?;
+        if round == 2 {
+            let limit = (4.0 * scale).max(0.15);
+            points.retain(|p| {
+                let ok = p.residual.abs() <= limit;
+                if !ok {
+                    rejected.push(p.raw);
+                }
+                ok
+            });
+        }
+        let c = (5.0 * scale).max(0.2);
+        for p in points.iter().filter(|p| p.residual.abs() < c) {
+            let (st, ct) = p.parameter.sin_cos();
+            let slope2 = (ct / e.a).powi(2) + (st / e.b).powi(2);
+            sums.add(p.edge.uv, (1.0 - (p.residual / c).powi(2)).powi(2) / (slope2 * p.edge.sigma * p.edge.sigma));
+        }
+        if points.len() < 12 {
+            return None;
+        }
+        e = sums.ellipse()?;
     }
+    let w = Walk::new(&e);
+    for p in &mut points {
+        let (d, _, t) = w.measure(p.edge.uv);
+        p.residual = d;
+        p.parameter = t;
+    }
+    points.sort_by(|a, b| a.parameter.total_cmp(&b.parameter));
+    let n = points.len() as f64;
+    let rms_px = (points.iter().map(|p| p.residual * p.residual).sum::<f64>() / n).sqrt();
+    let coverage = (n / bins as f64).min(1.0);
+    rejected.sort_by(|a, b| a.y.total_cmp(&b.y).then(a.x.total_cmp(&b.x)));
+    let good = coverage >= LEAST_COVERAGE && rms_px <= MOST_SCATTER_PX;
+    good.then_some(Contour { ellipse: e, bright_inside, points, rejected, coverage, rms_px })
 }
 
 /// Place along an ellipse in bins of equal arc length.

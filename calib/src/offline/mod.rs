@@ -34,6 +34,7 @@ pub mod roundbar;
 pub mod sampson;
 pub mod select;
 pub mod setpoint;
+pub mod sharpen;
 pub mod synthetic;
 pub mod torus;
 pub mod visibility;

@@ -22,7 +22,8 @@ const COVERAGE: f64 = 0.4;
 /// and for a distance that no painted line has.
 pub fn other_outline(edges: &ViewEdges<'_>, clicked: &Contour, strict: bool) -> Option<OtherOutline> {
     let e = &clicked.ellipse;
-    let least = if strict { (0.06 * e.a).max(5.0) } else { (0.03 * e.a).max(3.0) };
+    // A bar thinner than this looks like a line; nearer edges are its own shading.
+    let least = (0.06 * e.a).max(if strict { 5.0 } else { 4.0 });
     let sides: &[bool] = if strict { &[true] } else { &[true, false] };
     for opposite in sides {
         let bright_inside = clicked.bright_inside != *opposite;
