@@ -159,8 +159,8 @@ fn solve(slope: &[f64], width: f64, fit: &mut Fit) -> Option<()> {
     };
     let cost = |fit: &mut Fit| -> f64 {
         let mut sum = 0.0;
-        for i in 0..slope.len() {
-            let r = slope[i] - model(fit, at(i)).0;
+        for (i, s) in slope.iter().enumerate() {
+            let r = s - model(fit, at(i)).0;
             fit.left[i] = r;
             sum += r * r;
         }
