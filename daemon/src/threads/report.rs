@@ -1,7 +1,7 @@
 //! What ordinary threads tell each other for the status verb and the log. Locks live here, never on a real-time thread.
 
 use crossbeam::queue::ArrayQueue;
-use graspd_rt::cycle::{CycleRecord, Transition};
+use graspd_rt::cycle::{CycleRecord, Transition, Why};
 use graspd_rt::mode::ModeName;
 use graspd_rt::setpoint::SetPoint;
 use graspd_shm::control::{Percentiles, TelemetrySample};
@@ -47,11 +47,13 @@ impl Report {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Notes a change of mode.
+    /// Notes a change of mode. What began a stop stays its reason when the arm has come to rest.
     pub fn transition(&self, event: &Transition, why: &str) {
         let mut s = self.lock();
         s.mode = Some(event.to);
-        s.cause = why.to_owned();
+        if !matches!(event.why, Why::AtRest) {
+            why.clone_into(&mut s.cause);
+        }
     }
 
     /// Notes a beat.

@@ -108,6 +108,8 @@ pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &Report) ->
                         sample.set_cause(&why);
                     }
                     Why::Hold(_) => sample.set_cause(&why),
+                    // The end of a ramp says nothing new: what began it stays the reason.
+                    Why::AtRest => {}
                     _ if matches!(event.to, ModeName::Tracking | ModeName::Servoing | ModeName::Armed) => {
                         sample.fault = 0;
                         sample.set_cause("");

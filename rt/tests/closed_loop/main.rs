@@ -1,6 +1,7 @@
 //! The command cycle in lock step with a simulated arm and rig: does it arrive, and does it always stop?
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
+mod heap;
 mod world;
 
 use graspd_rt::cycle::{CommandCycle, CycleSettings, RequestKind, Stage, WatchSettings, Why};

@@ -343,6 +343,7 @@ impl World {
         let beat = self.pending.beat;
         let state = self.state(beat);
         let before = std::time::Instant::now();
+        let heap = crate::heap::calls();
         let output = self.cycle.step(&CommandInput {
             now_ns: self.now,
             robot: (!self.faults.no_state && !self.faults.link_down).then_some(state),
@@ -356,6 +357,7 @@ impl World {
             setpoint: offer.then_some(&self.setpoint),
             internal_fault: self.faults.internal,
         });
+        assert_eq!(crate::heap::calls(), heap, "a beat used the heap");
         self.step_ns.push(before.elapsed().as_nanos() as u64);
         self.pending = output.command;
         self.outputs = output.command.outputs;

@@ -1,0 +1,197 @@
+//! A simulated cell of processes for tests: a world on disk, a plan for it, and mock controller, scene and daemon as processes.
+#![allow(dead_code)] // every test uses its own part of it
+
+use graspd_calib::plan_cli::{Class, Request, run};
+use graspd_hil::scenario::{Options, Scenario};
+use graspd_rt::geom::View;
+use serde_json::Value;
+use std::io::{BufRead, BufReader, Write};
+use std::net::{TcpListener, TcpStream};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// A process of the cell; killed when dropped.
+pub(crate) struct Process {
+    pub(crate) child: Child,
+    pub(crate) ready: Value,
+}
+
+impl Process {
+    pub(crate) fn start(args: &[&str], log: &Path) -> Self {
+        let log = std::fs::File::options().create(true).append(true).open(log).unwrap();
+        let mut child = Command::new(env!("CARGO_BIN_EXE_graspd"))
+            .args(args)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::from(log))
+            .spawn()
+            .unwrap();
+        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        let ready = loop {
+            let line = lines.next().expect("ended before it was ready").unwrap();
+            if let Ok(v @ Value::Object(_)) = serde_json::from_str(&line) {
+                break v;
+            }
+        };
+        // Whatever else it says is read, so that it never blocks on a full pipe.
+        std::thread::spawn(move || lines.for_each(drop));
+        Self { child, ready }
+    }
+
+    pub(crate) fn alive(&mut self) -> bool {
+        self.child.try_wait().unwrap().is_none()
+    }
+
+    /// SIGKILL.
+    pub(crate) fn kill(&mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// A world, its plan and its daemon's configuration, in a folder of its own.
+pub(crate) struct World {
+    pub(crate) folder: PathBuf,
+    pub(crate) offset: u16,
+    pub(crate) joints: String,
+}
+
+impl World {
+    pub(crate) fn new(seed: u64) -> Self {
+        let folder = std::env::temp_dir().join(format!("graspd-kill-{}-{seed}", std::process::id()));
+        let _ = std::fs::remove_dir_all(&folder);
+        let scenario = Scenario::from_seed(seed, &Options::default()).unwrap();
+        scenario.save(&folder.join("world")).unwrap();
+        let mut renderer = scenario.renderer();
+        let shot = scenario.snapshot(&scenario.start, 1);
+        for (view, name) in [(View::Left, "left.png"), (View::Right, "right.png")] {
+            renderer.picture(view, &shot).save(folder.join(name)).unwrap();
+        }
+        let click = |eye: usize| Some(format!("{:.1},{:.1}", scenario.clicks[eye].x, scenario.clicks[eye].y));
+        let done = run(&Request {
+            left: folder.join("left.png"),
+            right: folder.join("right.png"),
+            rig: folder.join("world/rig.toml"),
+            gripper: folder.join("world/gripper.toml"),
+            select_left: click(0),
+            select_right: click(1),
+            out: Some(folder.join("plan.toml")),
+            ..Request::default()
+        });
+        assert_eq!(done.class, Class::Done, "{}", done.text);
+        let offset = (0..200)
+            .map(|k| 2000 + ((u64::from(std::process::id()) * 7 + seed * 131 + k * 41) % 30_000) as u16)
+            .find(|o| {
+                [29_999, 30_001, 30_002, 30_003, 30_004].iter().all(|p| TcpListener::bind(("127.0.0.1", p + o)).is_ok())
+            })
+            .unwrap();
+        let joints = scenario.start.map(|q| format!("{q:.9}")).join(",");
+        let config = format!(
+            "cell = \"kill\"\n[files]\nrig = \"world/rig.toml\"\ngripper = \"world/gripper.toml\"\n[shm]\nroot = \"shm\"\n\
+             [arm]\nmodel = \"ur5e\"\nport_offset = {offset}\nkinematics = \"world/arm.toml\"\n[loop]\nbest_effort = true\n"
+        );
+        std::fs::write(folder.join("graspd.toml"), config).unwrap();
+        Self { folder, offset, joints }
+    }
+
+    pub(crate) fn path(&self, name: &str) -> String {
+        self.folder.join(name).display().to_string()
+    }
+
+    pub(crate) fn mock(&self) -> Process {
+        let (offset, kinematics) = (self.offset.to_string(), self.path("world/true_arm.toml"));
+        let args = ["mock-ur", "--port-offset", &offset, "--start-joints", &self.joints, "--kinematics", &kinematics];
+        let more = ["--control-port", "0", "--limits", "0.5,4.0", "--exit-with-stdin"];
+        Process::start(&[&args[..], &more[..]].concat(), &self.folder.join("mock.log"))
+    }
+
+    pub(crate) fn scene(&self) -> Process {
+        let (world, rtde, root) = (self.path("world"), format!("127.0.0.1:{}", 30_004 + self.offset), self.path("shm"));
+        let args =
+            ["scene", "--world", &world, "--rtde", &rtde, "--shm-root", &root, "--cell", "kill", "--control-port", "0"];
+        Process::start(&args, &self.folder.join("scene.log"))
+    }
+
+    pub(crate) fn daemon(&self) -> Process {
+        Process::start(&["run", "--config", &self.path("graspd.toml")], &self.folder.join("graspd.log"))
+    }
+
+    /// A verb through the command line; whether it was accepted, and what was said.
+    pub(crate) fn verb(&self, verb: &[&str]) -> (bool, Value) {
+        let config = self.path("graspd.toml");
+        let out = Command::new(env!("CARGO_BIN_EXE_graspd"))
+            .args(verb)
+            .args(["--config", &config, "--json", "--timeout", "2"])
+            .output()
+            .unwrap();
+        (out.status.success(), serde_json::from_slice(&out.stdout).unwrap_or(Value::Null))
+    }
+
+    pub(crate) fn insist(&self, verb: &[&str]) {
+        let until = Instant::now() + Duration::from_secs(40);
+        loop {
+            let (accepted, said) = self.verb(verb);
+            if accepted {
+                return;
+            }
+            let log = std::fs::read_to_string(self.folder.join("graspd.log")).unwrap_or_default();
+            assert!(Instant::now() < until, "{verb:?} is refused: {said}\n{log}");
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    }
+
+    pub(crate) fn state(&self) -> (String, String) {
+        let (_, said) = self.verb(&["status"]);
+        let text = |key: &str| said.get(key).and_then(Value::as_str).unwrap_or("").to_owned();
+        (text("state"), text("cause"))
+    }
+
+    /// Plan in, armed, moving for `after`.
+    pub(crate) fn servo(&self, after: Duration) {
+        self.insist(&["setpoint", &self.path("plan.toml")]);
+        self.insist(&["arm"]);
+        self.insist(&["servo"]);
+        std::thread::sleep(after);
+    }
+
+    /// Waits for a fault or a hold and returns its words.
+    pub(crate) fn stopped(&self) -> String {
+        let until = Instant::now() + Duration::from_secs(10);
+        loop {
+            let (state, cause) = self.state();
+            if state == "fault" || (state == "armed" && cause.starts_with("H-")) {
+                return std::fs::read_to_string(self.folder.join("graspd.log")).unwrap();
+            }
+            assert!(Instant::now() < until, "still {state}: {cause}");
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+}
+
+/// Asks mock or scene through its control port.
+pub(crate) fn ask(part: &Process, line: &str) -> Value {
+    let port = ["control", "control_port"].iter().find_map(|k| part.ready[*k].as_u64()).unwrap() as u16;
+    let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
+    stream.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
+    writeln!(stream, "{line}").unwrap();
+    let mut answer = String::new();
+    BufReader::new(stream).read_line(&mut answer).unwrap();
+    serde_json::from_str(&answer).unwrap()
+}
+
+/// The oracle's summary, wherever the answer carries it.
+pub(crate) fn summary(mock: &Process) -> Value {
+    let v = ask(mock, r#"{"cmd":"summary"}"#);
+    ["/summary", "/answer", "/result", ""]
+        .iter()
+        .find_map(|p| v.pointer(p).filter(|s| s.get("limit_violations").is_some()).cloned())
+        .unwrap_or_else(|| panic!("no summary in {v}"))
+}
