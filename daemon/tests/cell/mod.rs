@@ -6,7 +6,7 @@ use graspd_hil::scenario::{Options, Scenario};
 use graspd_rt::geom::View;
 use serde_json::Value;
 use std::io::{BufRead, BufReader, Write};
-use std::net::{TcpListener, TcpStream};
+use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -60,7 +60,7 @@ impl Drop for Process {
 /// A world, its plan and its daemon's configuration, in a folder of its own.
 pub(crate) struct World {
     pub(crate) folder: PathBuf,
-    pub(crate) offset: u16,
+    pub(crate) address: String,
     pub(crate) joints: String,
 }
 
@@ -87,19 +87,16 @@ impl World {
             ..Request::default()
         });
         assert_eq!(done.class, Class::Done, "{}", done.text);
-        let offset = (0..200)
-            .map(|k| 2000 + ((u64::from(std::process::id()) * 7 + seed * 131 + k * 41) % 30_000) as u16)
-            .find(|o| {
-                [29_999, 30_001, 30_002, 30_003, 30_004].iter().all(|p| TcpListener::bind(("127.0.0.1", p + o)).is_ok())
-            })
-            .unwrap();
+        // A loopback address of its own: no port of another test, nor of an outgoing connection, can be in the way.
+        let id = std::process::id() + 131 * seed as u32;
+        let address = format!("127.{}.{}.{}", 16 + id / (254 * 254) % 40, 1 + id / 254 % 254, 1 + id % 254);
         let joints = scenario.start.map(|q| format!("{q:.9}")).join(",");
         let config = format!(
             "cell = \"kill\"\n[files]\nrig = \"world/rig.toml\"\ngripper = \"world/gripper.toml\"\n[shm]\nroot = \"shm\"\n\
-             [arm]\nmodel = \"ur5e\"\nport_offset = {offset}\nkinematics = \"world/arm.toml\"\n[loop]\nbest_effort = true\n"
+             [arm]\nmodel = \"ur5e\"\naddress = \"{address}\"\nkinematics = \"world/arm.toml\"\n[loop]\nbest_effort = true\n"
         );
         std::fs::write(folder.join("graspd.toml"), config).unwrap();
-        Self { folder, offset, joints }
+        Self { folder, address, joints }
     }
 
     pub(crate) fn path(&self, name: &str) -> String {
@@ -107,14 +104,14 @@ impl World {
     }
 
     pub(crate) fn mock(&self) -> Process {
-        let (offset, kinematics) = (self.offset.to_string(), self.path("world/true_arm.toml"));
-        let args = ["mock-ur", "--port-offset", &offset, "--start-joints", &self.joints, "--kinematics", &kinematics];
+        let (address, kinematics) = (&self.address, self.path("world/true_arm.toml"));
+        let args = ["mock-ur", "--bind", address, "--start-joints", &self.joints, "--kinematics", &kinematics];
         let more = ["--control-port", "0", "--limits", "0.5,4.0", "--exit-with-stdin"];
         Process::start(&[&args[..], &more[..]].concat(), &self.folder.join("mock.log"))
     }
 
     pub(crate) fn scene(&self) -> Process {
-        let (world, rtde, root) = (self.path("world"), format!("127.0.0.1:{}", 30_004 + self.offset), self.path("shm"));
+        let (world, rtde, root) = (self.path("world"), format!("{}:30004", self.address), self.path("shm"));
         let args =
             ["scene", "--world", &world, "--rtde", &rtde, "--shm-root", &root, "--cell", "kill", "--control-port", "0"];
         Process::start(&args, &self.folder.join("scene.log"))
@@ -179,7 +176,8 @@ impl World {
 /// Asks mock or scene through its control port.
 pub(crate) fn ask(part: &Process, line: &str) -> Value {
     let port = ["control", "control_port"].iter().find_map(|k| part.ready[*k].as_u64()).unwrap() as u16;
-    let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
+    let host = part.ready["address"].as_str().unwrap_or("127.0.0.1");
+    let mut stream = TcpStream::connect((host, port)).unwrap();
     stream.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
     writeln!(stream, "{line}").unwrap();
     let mut answer = String::new();

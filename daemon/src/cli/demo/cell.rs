@@ -52,19 +52,21 @@ pub(super) fn options(args: &DemoArgs) -> Result<Options, Failure> {
     Ok(o)
 }
 
-/// A port offset at which the controller's four services and its real-time port are free on the loopback address.
-fn free_offset(seed: u64) -> Result<u16, Failure> {
-    let start = (std::process::id() as u64).wrapping_mul(131).wrapping_add(seed.wrapping_mul(17));
+/// A loopback address of our own, on which the controller's ports are free. With an address a demo, neither another demo nor somebody's
+/// outgoing connection (those take ports of the range that an offset would lead into) can be in the way.
+fn free_address(seed: u64) -> Result<String, Failure> {
+    let start = u64::from(std::process::id()).wrapping_mul(131).wrapping_add(seed.wrapping_mul(17));
     for k in 0..200_u64 {
-        let offset = 1000 + ((start + k * 37) % 30_000) as u16;
+        let n = (start + k * 7919) % (60 * 254 * 254);
+        let address = format!("127.{}.{}.{}", 64 + n / (254 * 254), 1 + n / 254 % 254, 1 + n % 254);
         let free = [29_999_u16, 30_001, 30_002, 30_003, 30_004]
             .iter()
-            .all(|p| p.checked_add(offset).is_some_and(|p| TcpListener::bind(("127.0.0.1", p)).is_ok()));
+            .all(|port| TcpListener::bind((address.as_str(), *port)).is_ok());
         if free {
-            return Ok(offset);
+            return Ok(address);
         }
     }
-    Err(Failure::link("no five free ports for the mock controller on 127.0.0.1"))
+    Err(Failure::link("no free ports 29999 to 30004 for the mock controller on any of 200 loopback addresses"))
 }
 
 impl Cell {
@@ -77,7 +79,7 @@ impl Cell {
         let scenario = Scenario::from_seed(args.seed, &options(args)?)
             .map_err(|e| Failure::input(format!("no world can be drawn from seed {}: {e}", args.seed)))?;
         scenario.save(&world).map_err(|e| Failure::input(e.to_string()))?;
-        let offset = free_offset(args.seed)?;
+        let address = free_address(args.seed)?;
         let cell = format!("demo-{}", std::process::id());
         let shm = folder.join("shm");
         let s = |p: &Path| p.display().to_string();
@@ -87,9 +89,7 @@ impl Cell {
             "--model",
             scenario.model.name(),
             "--bind",
-            "127.0.0.1",
-            "--port-offset",
-            &offset.to_string(),
+            &address,
             &format!("--start-joints={joints}"),
             "--kinematics",
             &s(&world.join("true_arm.toml")),
@@ -109,7 +109,7 @@ impl Cell {
             "--world",
             &s(&world),
             "--rtde",
-            &format!("127.0.0.1:{}", 30_004 + offset),
+            &format!("{address}:30004"),
             "--rate",
             "60",
             "--shm-root",
@@ -122,7 +122,7 @@ impl Cell {
         let mut scene = Part::start("scene", &scene_args, folder)?;
         scene.json_line(READY)?;
         let config = folder.join("graspd.toml");
-        std::fs::write(&config, config_text(args, &cell, offset, scenario.model.name())).map_err(|e| {
+        std::fs::write(&config, config_text(args, &cell, &address, scenario.model.name())).map_err(|e| {
             Failure::input(format!("{}: cannot be written ({e}); choose another folder with --out", config.display()))
         })?;
         let mut daemon = Part::start("graspd", &["run".to_owned(), "--config".to_owned(), s(&config)], folder)?;
@@ -138,10 +138,10 @@ impl Cell {
     }
 }
 
-fn config_text(args: &DemoArgs, cell: &str, offset: u16, model: &str) -> String {
+fn config_text(args: &DemoArgs, cell: &str, address: &str, model: &str) -> String {
     format!(
         "# Written by graspd demo.\ncell = \"{cell}\"\n\n[files]\nrig = \"world/rig.toml\"\ngripper = \"world/gripper.toml\"\n\n\
-         [shm]\nroot = \"shm\"\n\n[arm]\nlink = \"rtde\"\naddress = \"127.0.0.1\"\nport_offset = {offset}\nmodel = \"{model}\"\n\
+         [shm]\nroot = \"shm\"\n\n[arm]\nlink = \"rtde\"\naddress = \"{address}\"\nmodel = \"{model}\"\n\
          kinematics = \"world/arm.toml\"\n\n# A simulated world shares its processors with the daemon.\n[loop]\nbest_effort = true\n\n[servo]\nviews = \"{}\"\n",
         args.views
     )
