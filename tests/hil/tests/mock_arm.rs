@@ -409,3 +409,66 @@ proptest! {
         prop_assert!(a.robot().truth.actual_q.iter().all(|q| q.is_finite()));
     }
 }
+
+#[test]
+fn a_stream_at_the_promise_passes_and_each_step_beyond_it_is_seen() {
+    // Up and down at exactly 4 rad/s2 to exactly 0.5 rad/s, through the real packages.
+    let mut c = Client::ready();
+    for sign in [1.0, -1.0] {
+        for k in 0..=62 {
+            c.command(1, sign * (f64::from(k) * 0.008).min(0.5));
+        }
+        for k in (0..=62).rev() {
+            c.command(1, sign * (f64::from(k) * 0.008).min(0.5));
+        }
+    }
+    c.command(0, 0.0);
+    let seen = c.arm.summary();
+    assert_eq!(seen.limit_violations, 0, "{:?}", seen.violations);
+    assert!((seen.max_setpoint_rate - 0.496).abs() < 5e-3 && (seen.max_setpoint_accel - 4.0).abs() < 1e-6);
+
+    let rules = |act: &dyn Fn(&mut Client)| {
+        let mut c = Client::ready();
+        act(&mut c);
+        let mut rules: Vec<Rule> = c.arm.summary().violations.iter().map(|v| v.rule).collect();
+        rules.dedup();
+        rules
+    };
+    // A hair beyond each: 1 % is allowed to the acceleration for rounding, nothing to the rate.
+    assert_eq!(rules(&|c| c.command(1, 0.008 * 1.005)), []);
+    assert_eq!(rules(&|c| c.command(1, 0.008 * 1.02)), [Rule::Accel]);
+    assert_eq!(
+        rules(&|c| {
+            c.run_up(0.5);
+            c.command(1, 0.5 * (1.0 + 1e-6));
+        }),
+        [Rule::Rate]
+    );
+    assert_eq!(rules(&|c| c.command(1, f64::NAN)), [Rule::Finite]);
+    assert_eq!(rules(&|c| c.command(0, 0.004)), [Rule::ZeroUnlessVelocity]);
+    // A client that has just connected begins from rest.
+    assert_eq!(
+        rules(&|c| {
+            c.run_up(0.3);
+            c.arm.connect();
+            c.command(1, 0.3);
+        }),
+        [Rule::Accel]
+    );
+    // The arm itself.
+    assert_eq!(
+        rules(&|c| {
+            c.arm.command(Command::Drift { joint: 4, rate: 3.2 }).unwrap();
+            c.command(0, 0.0);
+        }),
+        [Rule::ArmRate]
+    );
+    let far = [6.3, 0.0, 0.0, 0.0, 0.0, 0.0];
+    assert_eq!(
+        rules(&|c| {
+            c.arm.command(Command::Teleport { q: far }).unwrap();
+            c.command(0, 0.0);
+        }),
+        [Rule::ArmPosition]
+    );
+}

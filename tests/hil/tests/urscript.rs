@@ -143,7 +143,8 @@ fn runtime_errors_name_their_line() {
     for (body, line, part) in [
         ("x = 1 / 0", 2, "division by zero"),
         ("q = [1, 2]\nx = q[2]", 3, "out of range"),
-        ("if 1:\nend", 2, "boolean"),
+        ("if \"a\":\nend", 2, "boolean"),
+        ("if 1 and True:\nend", 2, "boolean"),
         ("write_output_integer_register(48, 1)", 2, "0 to 47"),
         ("set_payload(-1)", 2, "negative payload"),
         ("q = get_inverse_kin(p[3,0,0,0,0,0])", 2, "cannot be reached"),
@@ -198,9 +199,10 @@ fn a_killed_thread_gives_up_its_motion_and_the_main_thread_may_move() {
 }
 
 #[test]
-fn critical_sections_keep_the_others_waiting() {
+fn a_critical_section_is_not_interrupted_and_lets_others_run_while_its_thread_waits() {
     let text = "def t():\n global seen = 0\n thread other():\n  while True:\n   seen = seen + 1\n   sync()\n  end\n end\n run other()\n\
-        enter_critical\n enter_critical\n sync()\n sync()\n exit_critical\n during = seen\n exit_critical\n sync()\n sync()\n write_output_integer_register(0, during)\n write_output_integer_register(1, seen)\n halt\nend\n";
+        enter_critical\n enter_critical\n before = seen\n i = 0\n while i < 1000:\n i = i + 1\n end\n after = seen\n sync()\n sync()\n exit_critical\n\
+        exit_critical\n write_output_integer_register(0, after - before)\n write_output_integer_register(1, seen)\n halt\nend\n";
     let (desk, _, outcome) = run(text, 6);
     assert_eq!(outcome, StepOutcome::Finished);
     assert_eq!(desk.out_ints[0], 0);

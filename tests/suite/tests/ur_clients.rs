@@ -1,4 +1,5 @@
-//! Other people's clients against the mock controller: SDU's ur_rtde wheel as published, and a plain Python client.
+//! Other people's clients against the mock controller, as published on PyPI: SDU's ur_rtde; Universal Robots' own Python RTDE client in
+//! two editions, as two packages carry it; a dashboard client and one that sends bare script lines. And a plain Python client.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command as Order, Hosted, Setup};
@@ -7,8 +8,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
-/// SDU's client, the version that the mock is held to.
-const WHEEL: &str = "ur_rtde==1.6.5";
+/// The clients, in the versions that the mock is held to.
+const WHEELS: [&str; 5] = ["ur_rtde==1.6.5", "URsocket==0.2", "urpy==1.2.0", "ur-remote==0.1.3", "ur-aj==0.1.5"];
+/// Whether all of them are there, without running any of their code but SDU's.
+const PROBE: &str = "import rtde_control, rtde_receive, rtde_io; from importlib.util import find_spec as f; \
+    assert f('URsocket') and f('urpy') and f('ur_remote') and f('ur_aj')";
 
 fn python_dir() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("python")
@@ -44,13 +48,18 @@ fn run(command: &mut Command, limit: Duration) -> Result<ExitStatus, String> {
     }
 }
 
-/// A Python of its own with SDU's wheel, made once and kept in the target directory.
-fn python_with_wheel() -> Result<PathBuf, String> {
+/// A Python of its own with the wheels, made once and kept in the target directory. Tests of this process share it.
+fn python_with_wheels() -> Result<PathBuf, String> {
+    static MADE: std::sync::Mutex<Option<Result<PathBuf, String>>> = std::sync::Mutex::new(None);
+    MADE.lock().unwrap().get_or_insert_with(make_python).clone()
+}
+
+fn make_python() -> Result<PathBuf, String> {
     let home = Path::new(env!("CARGO_TARGET_TMPDIR")).join("ur-clients-venv");
     let python = home.join("bin/python");
     let has_wheel = |python: &Path| {
         let mut probe = Command::new(python);
-        probe.args(["-c", "import rtde_control, rtde_receive, rtde_io"]).stderr(Stdio::null());
+        probe.args(["-c", PROBE]).stderr(Stdio::null());
         run(&mut probe, Duration::from_secs(60)).is_ok_and(|s| s.success())
     };
     if has_wheel(&python) {
@@ -61,9 +70,11 @@ fn python_with_wheel() -> Result<PathBuf, String> {
         return Err("python3 -m venv failed".to_owned());
     }
     let mut pip = Command::new(&python);
-    pip.args(["-m", "pip", "install", "--quiet", "--only-binary", ":all:", WHEEL]);
+    // Without what they say they need: the parts that are used need nothing.
+    pip.args(["-m", "pip", "install", "--quiet", "--no-deps", "--only-binary", ":all:"]).args(WHEELS);
     run(&mut pip, Duration::from_secs(300))?;
-    if has_wheel(&python) { Ok(python) } else { Err(format!("{WHEEL} could not be installed; is PyPI out of reach?")) }
+    let reason = || format!("{WHEELS:?} could not be installed; is PyPI out of reach?");
+    if has_wheel(&python) { Ok(python) } else { Err(reason()) }
 }
 
 fn mock() -> Hosted {
@@ -74,7 +85,7 @@ fn mock() -> Hosted {
 
 #[test]
 fn sdus_receive_io_and_control_interfaces_drive_the_mock_unmodified() {
-    let python = match python_with_wheel() {
+    let python = match python_with_wheels() {
         Ok(python) => python,
         Err(reason) => return skip(&reason),
     };
@@ -90,6 +101,21 @@ fn sdus_receive_io_and_control_interfaces_drive_the_mock_unmodified() {
     assert_eq!(state["input_double"][19], -2.5);
     let seen = mock.ask(&Order::Summary).unwrap();
     assert_eq!(seen["limit_violations"], 0, "{seen}");
+}
+
+#[test]
+fn clients_from_pypi_find_a_robot() {
+    let python = match python_with_wheels() {
+        Ok(python) => python,
+        Err(reason) => return skip(&reason),
+    };
+    let mut mock = mock();
+    let mut command = Command::new(python);
+    command.arg(python_dir().join("pypi_clients.py")).arg(mock.address.to_string());
+    let status = run(&mut command, Duration::from_secs(120)).unwrap();
+    let state = mock.ask(&Order::State).unwrap();
+    assert!(status.success(), "{status}; the mock's state: {state}");
+    assert_eq!(state["input_int"][30], 4711);
 }
 
 #[test]

@@ -5,7 +5,7 @@ use super::robot::Robot;
 use crate::plant::{self, pose_to_vector, vector_to_pose};
 use crate::urscript::{
     Bank, Connect, Host, HostError, JointVector, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup, PoseVector,
-    Received, RobotView, Target, WatchdogAction,
+    Received, RobotView, Target, Value, WatchdogAction,
 };
 use std::collections::HashMap;
 use std::io::{ErrorKind, Read, Write};
@@ -279,6 +279,10 @@ impl Host for Robot {
             let voltage = self.signals.analog_types >> (2 + index) & 1 == 1;
             *out = if voltage { 10.0 * value } else { 0.004 + 0.016 * value };
         }
+    }
+
+    fn call(&mut self, name: &str, arguments: &[Value]) -> Result<Value, HostError> {
+        self.answer(name, arguments)
     }
 
     fn socket_connect(&mut self, name: &str, address: &str, port: u16) -> Connect {

@@ -213,10 +213,12 @@ impl Judge {
             if v != 0.0 && !moving {
                 self.violate(at_ns, Rule::ZeroUnlessVelocity, Some(joint), v);
             }
-            if let Some(last) = self.last.filter(|l| moving && l.rates[joint].is_finite()) {
+            // A client that has just connected finds an arm at rest: its first set-point counts from there.
+            let (from, last_beat) = self.last.map_or((0.0, now.beat), |l| (l.rates[joint], l.beat));
+            if moving && from.is_finite() {
                 // Beats that were skipped leave room for more change; a beat that stands still is one step at least.
-                let beats = f64::from(now.beat.wrapping_sub(last.beat).clamp(1, 1000));
-                let accel = (v - last.rates[joint]).abs() / (beats * limits.step_s);
+                let beats = f64::from(now.beat.wrapping_sub(last_beat).clamp(1, 1000));
+                let accel = (v - from).abs() / (beats * limits.step_s);
                 self.summary.max_setpoint_accel = self.summary.max_setpoint_accel.max(accel);
                 if accel > limits.accel * 1.01 + 1e-6 {
                     self.violate(at_ns, Rule::Accel, Some(joint), accel);
@@ -230,7 +232,7 @@ impl Judge {
         self.last = Some(now);
     }
 
-    /// A client connects anew: its first set-point is not compared with the one before.
+    /// A client connects anew: its first set-point is compared with rest, not with the last one of the client before.
     pub fn forget_client(&mut self) {
         self.last = None;
     }
@@ -332,7 +334,8 @@ mod tests {
         assert_eq!(rules(&j), [Rule::Finite; 6]);
         let mut j = judge();
         j.input(0, &package(1, 1, 0.51));
-        assert_eq!(rules(&j), [Rule::Rate; 6]);
+        // From rest it is too fast a change as well.
+        assert_eq!(rules(&j), [[Rule::Rate, Rule::Accel]; 6].as_flattened());
         let mut j = judge();
         let still = StepSample { at_ns: 0, q: [7.0; 6], qd: [0.0; 6], target_qd: [0.0; 6], target_qdd: [0.0; 6] };
         j.step(&still);

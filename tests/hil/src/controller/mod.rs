@@ -10,6 +10,8 @@ mod cli;
 mod command;
 mod connection;
 mod dashboard;
+#[cfg(test)]
+mod fuzz;
 mod host;
 mod hosted;
 mod judge;
@@ -17,6 +19,7 @@ mod link_faults;
 mod message;
 mod primary;
 mod program;
+mod questions;
 mod record;
 mod registers;
 mod report;

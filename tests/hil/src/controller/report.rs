@@ -46,6 +46,12 @@ pub struct ReportFault {
     pub swapped: Option<(usize, usize)>,
 }
 
+/// `speed_scaling`: what the trajectory limiter leaves of the speed that the slider asks for. Clients multiply it by
+/// `target_speed_fraction`, which is the slider itself.
+fn limiter(scaling: f64, slider: f64) -> f64 {
+    if slider > 1e-9 { (scaling / slider).min(1.0) } else { 1.0 }
+}
+
 impl Report {
     /// The report of the robot as it now is.
     pub(super) fn of(robot: &Robot) -> Report {
@@ -88,7 +94,7 @@ impl Report {
             elbow_position: elbow.into(),
             elbow_velocity: ((elbow_next - elbow) * 1e6).into(),
             tool_acceleration: [acceleration[0], acceleration[1], acceleration[2] + 9.82],
-            speed_scaling: robot.generator.scaling(),
+            speed_scaling: limiter(robot.generator.scaling(), robot.slider),
             momentum: speed(&actual_tcp_speed) * robot.setup.model.masses.iter().sum::<f64>() * 0.5,
             robot_current: 0.8 + actual_current.iter().map(|i| i.abs()).sum::<f64>() * 0.1,
         }

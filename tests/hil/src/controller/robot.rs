@@ -123,6 +123,7 @@ pub struct Robot {
     pub(super) motion_left_s: Option<f64>,
     pub(super) motion_failure: Option<String>,
     pub(super) sockets: super::host::Sockets,
+    pub(super) memory: super::questions::Memory,
     safety_since_s: f64,
     transition: Option<(f64, RobotMode)>,
     clock_offset_s: f64,
@@ -157,12 +158,13 @@ impl Robot {
             mute_outputs: false,
             claimed_robot_type: None,
             generator: Generator::new(q, setup.kinematics, setup.model.max_speed, setup.model.position_limit()),
-            drives: Drives::new(q, DRIVE_ACCEL),
+            drives: Drives::new(q, DRIVE_ACCEL).limited(setup.model.max_speed),
             programs: Programs::default(),
             watchdogs: Watchdogs::default(),
             motion_left_s: None,
             motion_failure: None,
             sockets: super::host::Sockets::default(),
+            memory: super::questions::Memory::default(),
             safety_since_s: f64::NEG_INFINITY,
             transition: None,
             clock_offset_s: 0.0,
@@ -184,6 +186,7 @@ impl Robot {
         self.move_arm();
         self.settle_runtime();
         self.truth = Report::of(self);
+        self.memory.note(&self.truth.actual_q, &self.truth.tcp_force);
         self.report = self.truth.distorted(&self.report_fault);
     }
 
@@ -389,7 +392,7 @@ impl Robot {
     /// Puts the arm at `q`, at rest (faults B07 and B11, and the start of a test).
     pub fn teleport(&mut self, q: Joints) {
         let fault = *self.drives.fault();
-        self.drives = Drives::new(q, DRIVE_ACCEL);
+        self.drives = Drives::new(q, DRIVE_ACCEL).limited(self.setup.model.max_speed);
         self.drives.set_fault(fault);
         self.drives.set_brakes(self.mode != RobotMode::Running);
         self.generator.snap(q);

@@ -101,9 +101,24 @@ impl Server {
             }
             let due = self.connections.iter().filter_map(Connection::next_due).min();
             let wake = due.map_or(deadline, |d| d.min(deadline));
-            self.wait(wake.saturating_sub(now_ns()), &mut buffer);
+            self.wait(wake.saturating_sub(now_ns()), &mut buffer, now_ns);
         }
         self.world.note(now_ns(), "stopped");
+    }
+
+    /// Deals with everything that clients have sent, without waiting. With [`Server::step`] in place of [`Server::run`] the caller
+    /// keeps the time: real sockets and real bytes on a virtual clock.
+    pub fn serve(&mut self, now: u64) {
+        let mut buffer = vec![0; READ];
+        self.wait(0, &mut buffer, || now);
+        self.act(now);
+        self.bury(now);
+    }
+
+    /// One control step at `now`, and what it sends to everybody.
+    pub fn step(&mut self, now: u64) {
+        self.world.step(now);
+        self.send_step(now);
     }
 
     /// Runs the steps that are due and returns the next deadline. After a stall the robot makes up its steps, and clients get
@@ -172,8 +187,8 @@ impl Server {
     }
 
     /// Sleeps until something happens, at most `for_ns`, and deals with it.
-    fn wait(&mut self, for_ns: u64, buffer: &mut [u8]) {
-        let now = now_ns();
+    fn wait(&mut self, for_ns: u64, buffer: &mut [u8], clock: impl Fn() -> u64) {
+        let now = clock();
         let mut polls = Vec::with_capacity(self.listeners.len() + self.connections.len());
         for l in &self.listeners {
             polls.push(PollFd::new(&l.socket, PollFlags::IN));
@@ -194,7 +209,7 @@ impl Server {
         }
         let ready: Vec<PollFlags> = polls.iter().map(PollFd::revents).collect();
         drop(polls);
-        let now = now_ns();
+        let now = clock();
         let listeners = self.listeners.len();
         let ends = PollFlags::IN | PollFlags::HUP | PollFlags::ERR;
         for i in 0..self.connections.len() {

@@ -193,7 +193,7 @@ impl World {
             Command::Jump { joint, rad, seconds } => {
                 let offset = robot.report_fault.offset.get_mut(joint).ok_or("joints are numbered 0 to 5")?;
                 *offset = rad;
-                self.jump_until = Some(robot.steps + (seconds / robot.dt).max(1.0) as u64);
+                self.jump_until = Some(robot.steps.saturating_add((seconds / robot.dt).max(1.0) as u64));
             }
             Command::SwapJoints { a, b } => robot.report_fault.swapped = Some((a, b)),
             Command::Drift { joint, rate } => {

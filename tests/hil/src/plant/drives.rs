@@ -21,6 +21,8 @@ pub struct Drives {
     /// Accelerations of the last step, rad/s^2.
     qdd: Joints,
     max_accel: f64,
+    /// What the motors turn at most, rad/s.
+    max_speed: Joints,
     fault: DriveFault,
     braked: bool,
     /// How far the drift has carried each joint away from where its own loop believes it to be, rad.
@@ -44,10 +46,18 @@ impl Drives {
             qd: [0.0; 6],
             qdd: [0.0; 6],
             max_accel,
+            max_speed: [f64::INFINITY; 6],
             fault: DriveFault::default(),
             braked: false,
             drifted: [0.0; 6],
         }
+    }
+
+    /// The same with motors that turn no faster than this.
+    #[must_use]
+    pub fn limited(mut self, max_speed: Joints) -> Self {
+        self.max_speed = max_speed;
+        self
     }
 
     /// Puts a disturbance on the joints; the default takes it away.
@@ -80,7 +90,7 @@ impl Drives {
                 if self.braked { 0.0 } else { target_qd[i] + gain * (target_q[i] - self.q[i] + self.drifted[i]) };
             let before = self.qd[i];
             let change = if self.braked { -before } else { blend * (wanted - before) };
-            self.qd[i] = before + change.clamp(-most, most);
+            self.qd[i] = (before + change.clamp(-most, most)).clamp(-self.max_speed[i], self.max_speed[i]);
             if self.fault.stuck[i] {
                 self.qd[i] = 0.0;
             }

@@ -285,8 +285,14 @@ impl Generator {
             self.safety_stop();
             self.brake(SAFETY_DECEL, dt);
         }
+        let result = result.and_then(|()| self.check(dt));
+        if matches!(result, Err(StopCause::JointSpeed { .. })) {
+            // A target beyond the limit never reaches the drives: the stop begins from the one before.
+            (self.q, self.qd) = (q, qd);
+            self.brake(SAFETY_DECEL, dt);
+        }
         self.qdd = std::array::from_fn(|i| (self.qd[i] - qd[i]) / dt);
-        result.and_then(|()| self.check(dt))
+        result
     }
 
     fn advance(&mut self, dt: f64) -> Result<(), StopCause> {

@@ -129,9 +129,9 @@ impl Machine {
         let mut i = 0;
         // Threads started in this step are appended and run in it; a cap on threads alive and dead bounds the loop.
         while i < self.fibres.len() {
-            let id = self.fibres[i].id;
-            let owner = self.fibres.iter().find(|f| f.critical > 0 && !f.dead).map(|f| f.id);
-            if self.fibres[i].dead || owner.is_some_and(|o| o != id) {
+            // A thread goes on until it waits, so nobody interrupts a critical section; while its thread waits inside it, the others
+            // run: UR's own driver script reads its socket inside one while its servo thread moves the arm.
+            if self.fibres[i].dead {
                 i += 1;
                 continue;
             }
@@ -256,6 +256,17 @@ impl Machine {
         }
     }
 
+    /// What `if` and `while` look at: UR's own driver script writes `if has_qnear:` with a number, so a number that is not zero
+    /// holds. `and`, `or` and `not` take booleans only.
+    fn pop_condition(&mut self, i: usize) -> Result<bool, String> {
+        match self.pop(i) {
+            Value::Int(n) => Ok(n != 0),
+            Value::Float(x) => Ok(x != 0.0),
+            Value::Bool(b) => Ok(b),
+            other => Err(format!("a condition must be a boolean, this is {}", other.type_name())),
+        }
+    }
+
     fn jump(&mut self, i: usize, target: usize) {
         if let Some(frame) = self.fibres[i].frames.last_mut() {
             frame.at = target;
@@ -335,7 +346,7 @@ impl Machine {
             }
             Op::Jump(target) => self.jump(i, target),
             Op::JumpIfFalse(target) => {
-                if !self.pop_bool(i)? {
+                if !self.pop_condition(i)? {
                     self.jump(i, target);
                 }
             }

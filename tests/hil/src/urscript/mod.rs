@@ -13,8 +13,9 @@
 //!   call takes one step;
 //! - at any outcome but `Running`, at a watchdog's stop and at a safety stop the program is over: watchdogs go away and the host
 //!   brings the arm to rest;
-//! - `is_within_safety_limits`, `get_freedrive_status`, `get_target_payload_inertia`, `tool_contact`,
-//!   `get_actual_joint_positions_history` and whatever else a client's script may name arrive at [`Host::call`].
+//! - functions that ask the controller for something that no motion program needs (`is_within_safety_limits`, `tool_contact`,
+//!   `get_actual_joint_positions_history`, ...) arrive at [`Host::call`] with their arguments bound, and so does whatever name the
+//!   interpreter does not know.
 //!
 //! Rules of the language come from UR's script manual and the behaviour of UR's and SDU's published scripts. Where a robot's
 //! behaviour is not documented, the stricter reading is taken, so that a script which runs here has a better chance there.

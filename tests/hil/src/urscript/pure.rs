@@ -4,6 +4,8 @@ use super::arithmetic::{Outcome, whole};
 use super::value::Value;
 use nalgebra::{Isometry3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
+/// Longest list that `make_list` gives, plus one.
+const MAX_LIST: usize = 10_000;
 /// Longest text that a script may build.
 pub(crate) const MAX_TEXT: usize = 16_384;
 
@@ -121,6 +123,7 @@ pub(crate) fn call(name: &str, a: &[Value]) -> Option<Outcome> {
         "normalize" => normalize(x),
         "length" | "get_list_length" | "size" => count(x),
         "transpose" => transpose(x),
+        "make_list" => index(x, MAX_LIST).map(|n| Value::List(vec![y.clone(); n])),
         "binary_list_to_integer" => bits_to_integer(x),
         "integer_to_binary_list" => {
             int32(x).map(|i| Value::List((0..32).map(|b| Value::Bool((i >> b) & 1 == 1)).collect()))
@@ -138,6 +141,7 @@ pub(crate) fn call(name: &str, a: &[Value]) -> Option<Outcome> {
             Ok(from_isometry(&Isometry3::from_parts(t, to.rotation * from.rotation.inverse())))
         }),
         "pose_dist" | "point_dist" => three(x).and_then(|p| Ok(Value::Float((three(y)? - p).norm()))),
+        "wrench_trans" => wrench_trans(x, y),
         "interpolate_pose" => frame(x).and_then(|from| {
             let (to, s) = (frame(y)?, finite(z)?);
             let t = from.translation.vector.lerp(&to.translation.vector, s);
@@ -166,6 +170,16 @@ pub(crate) fn call(name: &str, a: &[Value]) -> Option<Outcome> {
         "str_find" => find(x, y, z),
         _ => return None,
     })
+}
+
+/// A force and torque at one frame, as seen from the frame that `from_to` leads to.
+fn wrench_trans(from_to: &Value, wrench: &Value) -> Outcome {
+    let (frame, w) = (frame(from_to)?, six(wrench)?);
+    let (force, torque) = (Vector3::new(w[0], w[1], w[2]), Vector3::new(w[3], w[4], w[5]));
+    let back = frame.rotation.inverse();
+    let f = back * force;
+    let t = back * (torque - frame.translation.vector.cross(&force));
+    Ok(Value::floats(&[f.x, f.y, f.z, t.x, t.y, t.z]))
 }
 
 /// Absolute value of a number, Euclidean length of a list; of a pose that of its position.

@@ -3,7 +3,7 @@
 use super::arithmetic::Outcome;
 use super::builtins::{Flow, Wait};
 use super::host::{Connect, Host, Received};
-use super::pure::{MAX_TEXT, index, int32, number, text};
+use super::pure::{MAX_TEXT, boolean, index, int32, number, text};
 use super::value::Value;
 use std::collections::BTreeMap;
 
@@ -13,6 +13,8 @@ const MAX_SOCKETS: usize = 16;
 const MAX_BUFFER: usize = 1 << 16;
 /// Numbers per read; UR's limit is 30 for a list read.
 const MAX_NUMBERS: usize = 256;
+/// Bytes of a prefix or suffix of `socket_read_string`.
+const MAX_MARK: usize = 256;
 /// Seconds after which an attempt to connect fails.
 const CONNECT_SECONDS: f64 = 2.0;
 
@@ -34,7 +36,13 @@ pub(crate) enum Read {
     Bytes(usize),
     Floats(usize),
     Line,
-    Any,
+    /// Everything that is there, or the text between two marks.
+    Any {
+        prefix: String,
+        suffix: String,
+    },
+    /// The number in a line `name number`.
+    Variable(String),
 }
 
 /// Control steps in `seconds`, at least one; `None` (for ever) for zero and less, as UR's timeout of 0.
@@ -78,13 +86,34 @@ fn dispatch(function: &str, a: &[Value], host: &mut dyn Host, s: &mut SocketBuff
         "socket_read_ascii_float" => read(Read::Floats(index(x, MAX_NUMBERS)?), y, z, host, s),
         "socket_read_line" => read(Read::Line, x, y, host, s),
         "socket_read_string" => {
-            if !(text(y)?.is_empty() && text(z)?.is_empty()) {
-                return Err("socket_read_string with a prefix or suffix is not supported by this controller".to_owned());
-            }
-            read(Read::Any, x, a.get(4).unwrap_or(&none), host, s)
+            let escapes = boolean(a.get(3).unwrap_or(&none))?;
+            let what = Read::Any { prefix: mark(y, escapes)?, suffix: mark(z, escapes)? };
+            read(what, x, a.get(4).unwrap_or(&none), host, s)
         }
+        "socket_get_var" => {
+            let (name, socket) = (text(x)?.to_owned(), text(y)?);
+            if !(s.0.contains_key(socket) && host.socket_send(socket, format!("GET {name}\n").as_bytes())) {
+                return Ok(Flow::Value(Value::Int(0)));
+            }
+            read(Read::Variable(name), y, z, host, s)
+        }
+        "socket_set_var" => Ok(send(format!("SET {} {}\n", text(x)?, int32(y)?).as_bytes(), text(z)?, host, s)),
         _ => Err(format!("function '{function}' is not known to this controller")),
     }
+}
+
+/// A prefix or suffix, its escapes read where the script asks for that.
+fn mark(v: &Value, escapes: bool) -> Outcome<String> {
+    let plain = text(v)?;
+    if plain.len() > MAX_MARK {
+        return Err(format!("a prefix or suffix of more than {MAX_MARK} bytes"));
+    }
+    Ok(if escapes { plain.replace("\\n", "\n").replace("\\r", "\r").replace("\\t", "\t") } else { plain.to_owned() })
+}
+
+/// Where `mark` begins in `bytes`.
+fn position(bytes: &[u8], mark: &str) -> Option<usize> {
+    if mark.is_empty() { Some(0) } else { bytes.windows(mark.len()).position(|w| w == mark.as_bytes()) }
 }
 
 fn send(bytes: &[u8], name: &str, host: &mut dyn Host, s: &SocketBuffers) -> Flow {
@@ -137,7 +166,8 @@ fn nothing(what: &Read) -> Value {
     match what {
         Read::Integers(n) | Read::Bytes(n) => list(*n, Value::Int(-1)),
         Read::Floats(n) => list(*n, Value::Float(f64::NAN)),
-        Read::Line | Read::Any => Value::Str(String::new()),
+        Read::Line | Read::Any { .. } => Value::Str(String::new()),
+        Read::Variable(_) => Value::Int(0),
     }
 }
 
@@ -213,13 +243,24 @@ impl SocketBuffers {
                 let text = String::from_utf8_lossy(&line);
                 Some(Value::Str(text.trim_end_matches(['\r', '\n']).chars().take(MAX_TEXT / 4).collect()))
             }
-            Read::Any => {
-                if buffer.is_empty() {
+            Read::Any { prefix, suffix } => {
+                let from = position(buffer, prefix)? + prefix.len();
+                let rest = buffer.get(from..).unwrap_or_default();
+                let n = if suffix.is_empty() { rest.len() } else { position(rest, suffix)? };
+                if suffix.is_empty() && n == 0 {
                     return None;
                 }
-                let n = buffer.len().min(MAX_TEXT / 4);
-                let bytes: Vec<u8> = buffer.drain(..n).collect();
-                Some(Value::Str(String::from_utf8_lossy(&bytes).into_owned()))
+                let n = n.min(MAX_TEXT / 4);
+                let found = String::from_utf8_lossy(rest.get(..n).unwrap_or_default()).into_owned();
+                buffer.drain(..(from + n + suffix.len()).min(buffer.len()));
+                Some(Value::Str(found))
+            }
+            Read::Variable(name) => {
+                let end = line_end(buffer)?;
+                let line: Vec<u8> = buffer.drain(..=end).collect();
+                let line = String::from_utf8_lossy(&line);
+                let number = line.trim().strip_prefix(name.as_str()).and_then(|n| n.trim().parse().ok());
+                Some(Value::Int(number.unwrap_or(0)))
             }
         }
     }

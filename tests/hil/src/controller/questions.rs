@@ -1,0 +1,129 @@
+//! Functions of the script language that only ask the controller: history, contact, limits, temperatures.
+
+use super::robot::Robot;
+use crate::plant::Joints;
+use crate::urscript::{Host, HostError, KinematicsQuery, Value};
+use std::collections::VecDeque;
+
+/// Control steps kept for `get_actual_joint_positions_history`: two seconds at 500 Hz.
+const HISTORY: usize = 1000;
+/// A force at the tool that counts as contact, N.
+const CONTACT_N: f64 = 5.0;
+
+/// What scripts may ask about the past, and small states that only scripts know.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Memory {
+    /// Measured joint positions, newest last.
+    history: VecDeque<Joints>,
+    /// Control steps since the tool touched something; 0 while it touches nothing.
+    contact_steps: u32,
+    /// `set_flag`.
+    flags: u32,
+    random: u64,
+}
+
+impl Memory {
+    /// One control step passed.
+    pub(super) fn note(&mut self, q: &Joints, force: &[f64; 6]) {
+        if self.history.len() == HISTORY {
+            self.history.pop_front();
+        }
+        self.history.push_back(*q);
+        let touching = force.iter().take(3).map(|f| f * f).sum::<f64>().sqrt() > CONTACT_N;
+        self.contact_steps = if touching { self.contact_steps.saturating_add(1) } else { 0 };
+    }
+
+    fn random(&mut self) -> f64 {
+        self.random = self.random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.random >> 11) as f64 / (1u64 << 53) as f64
+    }
+}
+
+fn refused(text: impl Into<String>) -> HostError {
+    HostError::Refused(text.into())
+}
+
+fn six(v: Option<&Value>) -> Option<[f64; 6]> {
+    v.and_then(Value::as_six).filter(|s| s.iter().all(|x| x.is_finite()))
+}
+
+fn whole(v: Option<&Value>, limit: usize) -> Option<usize> {
+    let x = v.and_then(Value::as_f64)?;
+    (x.fract() == 0.0 && x >= 0.0 && x < limit as f64).then_some(x as usize)
+}
+
+impl Robot {
+    /// Answers a function of the script that moves nothing.
+    ///
+    /// # Errors
+    /// Unknown names, and arguments that the function does not take.
+    pub(super) fn answer(&mut self, name: &str, a: &[Value]) -> Result<Value, HostError> {
+        let bad = |what: &str| refused(format!("{name}: {what}"));
+        Ok(match name {
+            "get_actual_joint_positions_history" => {
+                let back = whole(a.first(), usize::MAX).ok_or_else(|| bad("a number of steps from 0 on is needed"))?;
+                // The manual: steps beyond what is kept give the oldest that is.
+                let at = self.memory.history.len().saturating_sub(1).saturating_sub(back);
+                Value::floats(&self.memory.history.get(at).copied().unwrap_or(self.truth.actual_q))
+            }
+            "get_target_joint_accelerations" => Value::floats(&self.truth.target_qdd),
+            "get_target_payload_inertia" => Value::floats(&self.payload.inertia),
+            "is_within_safety_limits" => Value::Bool(self.within_limits(a).ok_or_else(|| bad("a pose or six joints"))?),
+            "tool_contact" => {
+                let force = self.truth.tcp_force;
+                let along = match a.first() {
+                    None | Some(Value::None) => None,
+                    some => Some(six(some).ok_or_else(|| bad("the direction is a pose or six numbers"))?),
+                };
+                // A direction asks for contact that opposes a motion that way; none, or zero, asks for any.
+                let opposes = along.is_none_or(|d| {
+                    let dot: f64 = d.iter().zip(&force).take(3).map(|(d, f)| d * f).sum();
+                    d.iter().take(3).all(|v| *v == 0.0) || dot < 0.0
+                });
+                let steps = if opposes { self.memory.contact_steps } else { 0 };
+                Value::Int(i32::try_from(steps).unwrap_or(i32::MAX))
+            }
+            // 0 normal, 1 near a singularity, 2 too near.
+            "get_freedrive_status" => Value::Int(0),
+            "get_joint_temp" => {
+                let joint = whole(a.first(), 6).ok_or_else(|| bad("joints are numbered 0 to 5"))?;
+                Value::Float(28.0 + 0.5 * self.truth.actual_current.get(joint).map_or(0.0, |i| i.abs()))
+            }
+            "get_controller_temp" => Value::Float(30.0),
+            "get_tool_current" => Value::Float(0.01),
+            "get_tool_accelerometer_reading" => Value::floats(&self.truth.tool_acceleration),
+            "get_flag" => {
+                let n = whole(a.first(), 32).ok_or_else(|| bad("flags are numbered 0 to 31"))?;
+                Value::Bool(self.memory.flags >> n & 1 == 1)
+            }
+            "set_flag" => {
+                let n = whole(a.first(), 32).ok_or_else(|| bad("flags are numbered 0 to 31"))?;
+                let Some(Value::Bool(on)) = a.get(1) else { return Err(bad("a boolean is needed")) };
+                self.memory.flags = self.memory.flags & !(1 << n) | u32::from(*on) << n;
+                Value::None
+            }
+            "random" => Value::Float(self.memory.random()),
+            _ => return Err(HostError::UnknownFunction(name.to_owned())),
+        })
+    }
+
+    /// Whether joints, or a pose by its nearest solution, lie inside the joint limits.
+    fn within_limits(&self, a: &[Value]) -> Option<bool> {
+        let limit = self.setup.model.position_limit();
+        let q = match a.first()? {
+            Value::Pose(pose) => {
+                let near = six(a.get(1));
+                let (max_position_error, max_orientation_error) = (1e-10, 1e-10);
+                self.inverse_kinematics(&KinematicsQuery {
+                    pose: *pose,
+                    near,
+                    max_position_error,
+                    max_orientation_error,
+                    tcp: None,
+                })
+            }
+            joints => Some(six(Some(joints))?),
+        };
+        Some(q.is_some_and(|q| q.iter().zip(limit).all(|(q, l)| q.abs() <= l)))
+    }
+}
