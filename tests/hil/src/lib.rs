@@ -1,6 +1,7 @@
 //! The simulated world.
 
 pub mod controller;
+mod host;
 pub mod mock_arm;
 pub mod plant;
 pub mod scenario;

@@ -182,17 +182,11 @@ fn run(args: &Args) -> Result<(), StartError> {
     }
     let world = World::new(Robot::new(setup), limits, recorder);
     let mut server = Server::bind(world, args.bind, args.port_offset, args.control_port)?;
-    prefer_this_process();
+    crate::host::prefer_this_thread(crate::host::CONTROLLER, -15);
     announce(args, &server);
     server.run(&stop);
     conclude(server);
     Ok(())
-}
-
-/// A controller keeps its beat on a busy host: best effort, since an ordinary user may not ask for it.
-fn prefer_this_process() {
-    let _ = rustix::process::setpriority_process(None, -15);
-    let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
 }
 
 /// The ready line: everything that a test needs to connect.

@@ -15,7 +15,7 @@ const KEEP: usize = 256;
 /// One look at the arm.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Sample {
-    /// When it was received, CLOCK_MONOTONIC nanoseconds.
+    /// When the controller took it, CLOCK_MONOTONIC nanoseconds.
     pub(super) at_ns: u64,
     /// Measured joints, rad.
     pub(super) q: Joints,
@@ -94,6 +94,7 @@ impl Arm {
     pub(super) fn follow(&self, address: String, stop: Arc<AtomicBool>) {
         let arm = self.clone();
         std::thread::spawn(move || {
+            crate::host::prefer_this_thread(crate::host::EXPOSURE, -12);
             let mut last = String::new();
             while !stop.load(Ordering::Relaxed) {
                 if let Err(e) = arm.session(&address, &stop) {
@@ -118,16 +119,18 @@ impl Arm {
         stream.set_nodelay(true).map_err(text)?;
         stream.set_read_timeout(Some(Duration::from_millis(500))).map_err(text)?;
         stream.set_write_timeout(Some(Duration::from_millis(500))).map_err(text)?;
-        let outputs = ["actual_q", "actual_digital_output_bits"];
+        let outputs = ["actual_q", "actual_digital_output_bits", "timestamp"];
         let mut session = Session::new(&outputs, &[], None).map_err(|e| e.to_string())?;
-        let (Some(joints), Some(bits)) =
-            (session.outputs().slot::<Joints>(outputs[0]), session.outputs().slot::<u64>(outputs[1]))
+        let slots = session.outputs();
+        let (Some(joints), Some(bits), Some(clock)) =
+            (slots.slot::<Joints>(outputs[0]), slots.slot::<u64>(outputs[1]), slots.slot::<f64>(outputs[2]))
         else {
             return Err("the protocol's tables lack actual_q".into());
         };
         let mut framer = Framer::new(vec![0u8; 1 << 16]);
         let mut out = [0u8; 4096];
         let mut silent = 0;
+        let mut times = ClockMap::default();
         while !stop.load(Ordering::Relaxed) {
             while let Some(n) = session.transmit(&mut out).map_err(|e| e.to_string())? {
                 stream.write_all(out.get(..n).unwrap_or_default()).map_err(text)?;
@@ -149,7 +152,8 @@ impl Arm {
             let at_ns = now_ns();
             while let Some(package) = framer.next().map_err(|e| e.to_string())? {
                 if let Event::Data(values) = session.handle(package).map_err(|e| e.to_string())? {
-                    self.take(joints, bits, values, at_ns);
+                    let taken = clock.read(values).map_or(at_ns, |stamp| times.to_host(stamp, at_ns));
+                    self.take(joints, bits, values, taken);
                 }
             }
         }
@@ -165,9 +169,52 @@ impl Arm {
     }
 }
 
+/// The controller's clock on the host's: a package can be late, never early, so that the least delay seen is the clocks' difference.
+#[derive(Debug, Default)]
+struct ClockMap {
+    /// Host minus controller, ns, and when (host) it was learnt.
+    offset: Option<(f64, u64)>,
+}
+
+impl ClockMap {
+    /// How fast the two clocks may run apart, and the jump that is a restart.
+    const DRIFT: f64 = 1e-4;
+    const RESTART_NS: f64 = 1e9;
+
+    /// When a package with this stamp (s) was made, given when it was read.
+    fn to_host(&mut self, stamp_s: f64, read_ns: u64) -> u64 {
+        let found = read_ns as f64 - stamp_s * 1e9;
+        let (offset, since) = self.offset.unwrap_or((found, read_ns));
+        let grown = offset + Self::DRIFT * read_ns.saturating_sub(since) as f64;
+        let offset = if !(found - grown).is_finite() || (found - grown).abs() > Self::RESTART_NS {
+            found
+        } else {
+            grown.min(found)
+        };
+        self.offset = Some((offset, read_ns));
+        ((stamp_s * 1e9 + offset) as u64).min(read_ns)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_late_package_keeps_the_time_it_was_made_at() {
+        let mut clock = ClockMap::default();
+        for k in 0..1000u64 {
+            let made = 5_000_000_000 + 2_000_000 * k;
+            // Up to 30 ms late now and then, as a batch.
+            let late = if k % 50 < 15 { 2_000_000 * (15 - k % 50) } else { 50_000 };
+            let at = clock.to_host(100.0 + 0.002 * k as f64, made + late);
+            if k > 60 {
+                assert!(at.abs_diff(made + 50_000) < 20_000, "{k}: {at} for {made}");
+            }
+        }
+        // A controller that was restarted counts from zero.
+        assert_eq!(clock.to_host(0.0, 60_000_000_000), 60_000_000_000);
+    }
 
     #[test]
     fn joints_between_two_looks_are_in_proportion_and_outside_they_hold() {

@@ -90,8 +90,6 @@ fn run(args: &Args) -> Result<(), SceneError> {
     if !(0.5..=500.0).contains(&args.rate) {
         return Err(SceneError::Rate(args.rate));
     }
-    // A camera keeps its rate on a busy host: best effort, since an ordinary user may not ask for it.
-    let _ = rustix::process::setpriority_process(None, -10);
     let scenario = match (&args.world, args.seed) {
         (Some(dir), _) => Scenario::load(dir)?,
         (None, Some(seed)) => Scenario::from_seed(seed, &args.options())?,
@@ -129,8 +127,8 @@ fn run(args: &Args) -> Result<(), SceneError> {
     if let Some(address) = &args.rtde {
         arm.follow(address.clone(), Arc::clone(&stop));
     }
-    // A real camera takes no time from the controller's processor; a simulated one steps back.
-    let _ = rustix::process::nice(2);
+    // A camera keeps its rate on a busy host, and takes no time from the controller's processor.
+    crate::host::prefer_this_thread(crate::host::RENDERER, -8);
     let renderer = scenario.renderer();
     let node = create_node(&names, "graspd-scene")?;
     let seed = scenario.seed;

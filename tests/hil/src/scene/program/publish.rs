@@ -21,6 +21,8 @@ pub(super) const SERIALS: [&str; 2] = ["sim-left", "sim-right"];
 const EXPOSURE_NS: u64 = 2_000_000;
 /// How long to wait for a look at the arm after the exposure, ns.
 const PATIENCE_NS: u64 = 8_000_000;
+/// A controller that said nothing for so long is not late but gone, ns.
+const SILENT_NS: u64 = 60_000_000;
 /// How fast the jaws move, m/s.
 const JAW_SPEED: f64 = 0.08;
 
@@ -160,7 +162,12 @@ impl Loop {
                 self.shared.with(|i| i.late += lost);
             }
             sleep_until(capture + self.latency_ns);
-            self.wait_for_arm(capture);
+            if !self.wait_for_arm(capture) {
+                // Nobody knows where the arm was then: a pair less is honest, a wrong one is not.
+                self.publisher.skip();
+                self.shared.with(|i| i.late += 1);
+                continue;
+            }
             self.pair(node, &active, capture, trigger, (now_ns() - start) as f64 * 1e-9)?;
             if let Some(ready) = ready.take() {
                 ready();
@@ -169,15 +176,18 @@ impl Loop {
         Ok(())
     }
 
-    /// Waits until the arm was looked at after the exposure, so that its joints then lie between two looks.
-    fn wait_for_arm(&self, capture: u64) {
+    /// Waits until the arm was looked at after the exposure, so that its joints then lie between two looks. False when a controller
+    /// that is connected and sending did not come in time.
+    fn wait_for_arm(&self, capture: u64) -> bool {
         if !self.arm.link().0 {
-            return;
+            return true;
         }
         let end = capture + self.latency_ns + PATIENCE_NS;
         while now_ns() < end && self.arm.newest().is_none_or(|s| s.at_ns < capture) {
             sleep_until(now_ns() + 500_000);
         }
+        // One that stands still for longer than that is a fault of the robot's, not of the cameras, which go on.
+        self.arm.newest().is_none_or(|s| s.at_ns >= capture || capture - s.at_ns > SILENT_NS)
     }
 
     /// Renders and publishes one pair.
