@@ -26,7 +26,7 @@ pub fn cycle_config(c: &Config, dh: Dh, realtime: bool) -> CycleConfig {
         },
         gain_far_per_s: raw.servo.gain,
         gain_near_per_s: raw.servo.gain_near,
-        min_points: u8::try_from(raw.vision.min_observations).unwrap_or(u8::MAX),
+        min_points: min_points(raw.vision.min_observations, &raw.servo.views),
         ..LawSettings::default()
     };
     let limits = LimitSettings {
@@ -120,4 +120,10 @@ pub fn load_kinematics(path: &Path, model: Model) -> Result<Dh, Failure> {
         }
     }
     Ok(Dh { a: t.a, d: t.d, alpha: t.alpha, theta: t.theta })
+}
+
+/// One picture shows half of what two do.
+fn min_points(both_views: usize, views: &str) -> u8 {
+    let needed = if views == "stereo" { both_views } else { both_views.div_ceil(2) };
+    u8::try_from(needed).unwrap_or(u8::MAX)
 }

@@ -156,7 +156,8 @@ impl Motion {
         let mount = &c.gripper.flange_from_gripper;
         let pose = seen.vision.left_from_gripper * c.dh.gripper_motion(&seen.q, q, mount);
         let screw = self.stack(c, seen, &pose, best).map_err(|e| match e {
-            ScrewError::TooFewPoints { .. } | ScrewError::NotFinite => HoldCause::MarksLost,
+            ScrewError::TooFewPoints { points, needed } => HoldCause::FewPoints { points, needed },
+            ScrewError::NotFinite => HoldCause::NoSolution,
             ScrewError::IllConditioned { sigma_min, condition } => HoldCause::Geometry { sigma_min, condition },
         })?;
         let lag = s.law.size(&screw.correction);
@@ -173,7 +174,7 @@ impl Motion {
         }
         let found = joint_rates(jacobian, &xi, &s.rates).map_err(|e| match e {
             RateError::Singular { sigma_min, joint } => HoldCause::Singular { sigma_min, joint },
-            RateError::NotFinite => HoldCause::MarksLost,
+            RateError::NotFinite => HoldCause::NoSolution,
         })?;
         let mut rates = found.rates;
         let over = (0..6).fold(1.0_f64, |m, i| m.max(math::fabs(rates[i]) / (pace.velocity[i] * pace.share)));

@@ -245,6 +245,15 @@ impl fmt::Display for FaultCause {
 pub enum HoldCause {
     /// H-01: too few marks are seen.
     MarksLost,
+    /// H-10: the law got fewer image points than it needs.
+    FewPoints {
+        /// Image points in the pictures in use (a mark in one view is one).
+        points: u8,
+        /// Points needed.
+        needed: u8,
+    },
+    /// H-11: the law found no finite solution in this beat.
+    NoSolution,
     /// H-02: the marks seen do not fix the motion (B12).
     Geometry {
         /// Smallest singular value, px/m.
@@ -292,6 +301,8 @@ impl HoldCause {
     pub const fn code(&self) -> &'static str {
         match self {
             HoldCause::MarksLost => "H-01",
+            HoldCause::FewPoints { .. } => "H-10",
+            HoldCause::NoSolution => "H-11",
             HoldCause::Geometry { .. } => "H-02",
             HoldCause::Singular { .. } => "H-03",
             HoldCause::JointEnd { .. } => "H-04",
@@ -307,7 +318,14 @@ impl HoldCause {
 impl fmt::Display for HoldCause {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            HoldCause::MarksLost => write!(f, "too few marks are seen: clear the view, then servo again"),
+            HoldCause::MarksLost => write!(f, "the marks are not seen: clear the view, then servo again"),
+            HoldCause::FewPoints { points, needed } => write!(
+                f,
+                "only {points} marks are seen in the pictures in use, {needed} are needed: clear the view, then servo again"
+            ),
+            HoldCause::NoSolution => {
+                write!(f, "the law found no finite solution: stop, and look at rig and gripper files")
+            }
             HoldCause::Geometry { sigma_min, condition } => write!(
                 f,
                 "the marks seen do not fix the motion (sigma {sigma_min:.1} px/m, condition {condition:.0}): show more marks"

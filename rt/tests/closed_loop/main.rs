@@ -128,7 +128,7 @@ fn any_fault_at_any_instant_ends_at_rest() {
         (|f| f.skewed = true, "H-08", 90),
         (|f| f.stall = true, "F-TIM-01", 32),
         (|f| f.lost_marks = true, "H-01", 90),
-        (|f| f.nan_marks = true, "H-01", 60),
+        (|f| f.nan_marks = true, "H-10", 60),
         (|f| f.jump_marks = true, "F-MRK-01", 120),
         (|f| f.slider_zero = true, "H-06", 4),
     ];

@@ -65,7 +65,9 @@ pub fn run(args: &DemoArgs) -> Result<Exit, Failure> {
 
     say.step("on line: servoing");
     let bar = say.bar();
-    let over = |s: &TelemetrySample| s.state == watch::CONVERGED || s.state == watch::FAULT;
+    // A hold ends in armed, and only an operator would go on from there.
+    let held = |s: &TelemetrySample| s.state == watch::ARMED && s.cause_text().starts_with("H-");
+    let over = |s: &TelemetrySample| s.state == watch::CONVERGED || s.state == watch::FAULT || held(s);
     let outcome =
         watch::until(&node, &mut cell, Duration::from_secs_f64(args.timeout), |s| say.progress(&bar, s), over)?;
     bar.finish_and_clear();

@@ -9,6 +9,8 @@ use std::time::{Duration, Instant};
 /// Words of the telemetry's state number.
 pub(super) const STATES: [&str; 7] = ["idle", "tracking", "armed", "servoing", "converged", "stopping", "fault"];
 
+/// State number of an armed daemon.
+pub(super) const ARMED: u32 = 2;
 /// State number of a converged daemon.
 pub(super) const CONVERGED: u32 = 4;
 /// State number of a fault.
