@@ -3,6 +3,7 @@
 
 pub mod files;
 pub mod golden;
+pub mod mesh_cli;
 pub mod montecarlo;
 pub mod offline;
 pub mod plan_cli;

@@ -288,13 +288,13 @@ pub fn run(cell: &Cell, trials: usize, seed: u64) -> (Option<Outcome>, Outcome) 
     (if cell.ratio == 1.0 { Some(circle.outcome()) } else { None }, ellipse.outcome())
 }
 
-/// The study as a table: every cell, both models. `progress` is called after each cell with its name.
-pub fn table(trials: usize, seed: u64, mut progress: impl FnMut(&str)) -> String {
+/// The study as a table: the given cells, both models. `progress` is called after each cell with its name.
+pub fn table(cells: &[Cell], trials: usize, seed: u64, mut progress: impl FnMut(&str)) -> String {
     let mut out = String::from(
         "cell                        model    trials refused  centre mm (95 %)  normal deg (95 %)  RMSE/CRB c     n    coverage  d2(3)  d2(5)\n",
     );
-    for cell in cells() {
-        let (circle, ellipse) = run(&cell, trials, seed);
+    for cell in cells {
+        let (circle, ellipse) = run(cell, trials, seed);
         for (model, o) in [("circle", circle), ("ellipse", Some(ellipse))] {
             let Some(o) = o else { continue };
             // Writing to a String cannot fail.

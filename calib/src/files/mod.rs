@@ -9,6 +9,7 @@ mod boxes;
 mod error;
 mod gripper;
 mod hash;
+mod mesh;
 mod plan;
 mod pose;
 mod rig;
@@ -17,9 +18,10 @@ pub use boxes::OrientedBox;
 pub use error::FileError;
 pub use gripper::{Finger, GripperFile};
 pub use hash::ContentHash;
+pub use mesh::{Pick, PicksFile, PoseFile};
 pub use plan::{
-    CandidateRecord, ConeRecord, EdgeRecord, GoalRecord, MarkRecord, ModelRecord, ObjectRecord, PathRecord,
-    PictureRecord, PlanFile, SelectionRecord, SourceRecord, ViewPair,
+    CandidateRecord, ConeRecord, EdgeRecord, GoalRecord, GripRecord, MarkRecord, MeshRecord, ModelRecord, ObjectRecord,
+    PathRecord, PickRecord, PictureRecord, PlanFile, SelectionRecord, SourceRecord, ViewPair,
 };
 pub use pose::PoseRecord;
 pub use rig::{Quality, RigFile};

@@ -169,6 +169,57 @@ pub struct CandidateRecord {
     pub marks_seen: [usize; 2],
     /// "chosen", "possible", or why it was dropped.
     pub verdict: String,
+    /// A box handle's faces and ways.
+    #[serde(rename = "box", default, skip_serializing_if = "Option::is_none")]
+    pub grip: Option<GripRecord>,
+}
+
+/// How the claws take a box handle, in the mesh's own frame.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GripRecord {
+    /// Distance between the faces, metres.
+    pub width_m: f64,
+    /// What each claw presses, square metres.
+    pub contact_m2: f64,
+    /// Closing direction, unit.
+    pub closing: [f64; 3],
+    /// Direction of the approach, unit.
+    pub approach: [f64; 3],
+}
+
+/// The part of a polyhedral plan: its mesh and where it stands.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MeshRecord {
+    /// SHA-256 of the mesh file.
+    pub hash: String,
+    /// Length of the file's unit, metres.
+    pub unit_m: f64,
+    /// Triangles with an area.
+    pub triangles: usize,
+    /// Edges of its bounding box, metres.
+    pub size_m: [f64; 3],
+    /// Where it stands.
+    pub left_from_mesh: PoseRecord,
+    /// Root mean square distance of the picked pixels from where the pose puts their points.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rms_px: Option<f64>,
+    /// The points picked, if the pose came from them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub picked: Vec<PickRecord>,
+}
+
+/// A point of a mesh and where it was picked.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PickRecord {
+    /// The point in the mesh's frame, metres.
+    pub point_m: [f64; 3],
+    /// Its pixel in the left picture.
+    pub left_px: [f64; 2],
+    /// Its pixel in the right picture.
+    pub right_px: [f64; 2],
 }
 
 /// A mark at a goal.
@@ -253,6 +304,9 @@ pub struct PlanFile {
     /// The two cones.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cones: Option<ConeRecord>,
+    /// The mesh of a polyhedral part.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mesh: Option<MeshRecord>,
     /// Every rim model that was fitted.
     #[serde(default)]
     pub model: Vec<ModelRecord>,

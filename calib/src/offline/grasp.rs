@@ -122,6 +122,7 @@ impl Place {
             visibility_usr: self.sights.map(|s| s.solid_angle * 1e6),
             marks_seen: self.seen,
             verdict,
+            grip: None,
         }
     }
 }

@@ -15,20 +15,20 @@ use nalgebra::Point3;
 
 const BACK: Rgba = [13, 17, 23, 255];
 const PANEL: Rgba = [22, 27, 34, 255];
-const BRIGHT: Rgba = [240, 246, 252, 255];
-const DIM: Rgba = [139, 148, 158, 255];
-const EDGE: Rgba = [88, 240, 140, 255];
-const REJECT: Rgba = [255, 92, 92, 235];
-const RIM: Rgba = [255, 196, 0, 255];
-const NORMAL: Rgba = [64, 200, 255, 255];
-const MARK: Rgba = [255, 96, 200, 255];
-const CLICK: Rgba = [255, 255, 255, 255];
+pub(in crate::offline) const BRIGHT: Rgba = [240, 246, 252, 255];
+pub(in crate::offline) const DIM: Rgba = [139, 148, 158, 255];
+pub(in crate::offline) const EDGE: Rgba = [88, 240, 140, 255];
+pub(in crate::offline) const REJECT: Rgba = [255, 92, 92, 235];
+pub(in crate::offline) const RIM: Rgba = [255, 196, 0, 255];
+pub(in crate::offline) const NORMAL: Rgba = [64, 200, 255, 255];
+pub(in crate::offline) const MARK: Rgba = [255, 96, 200, 255];
+pub(in crate::offline) const CLICK: Rgba = [255, 255, 255, 255];
 const STEEL: [u8; 3] = [196, 214, 232];
 const JAW: [u8; 3] = [255, 176, 64];
 
 /// A view being drawn: ideal and spatial coordinates to canvas pixels.
-struct Panel<'a> {
-    canvas: Canvas,
+pub(in crate::offline) struct Panel<'a> {
+    pub(in crate::offline) canvas: Canvas,
     zoom: f64,
     lens: Lens,
     view: View,
@@ -36,7 +36,7 @@ struct Panel<'a> {
 }
 
 impl<'a> Panel<'a> {
-    fn new(picture: &Picture, view: View, rig: &'a RigFile, zoom: f64) -> Option<Self> {
+    pub(in crate::offline) fn new(picture: &Picture, view: View, rig: &'a RigFile, zoom: f64) -> Option<Self> {
         let (w, h) = ((picture.width() as f64 * zoom).round() as u32, (picture.height() as f64 * zoom).round() as u32);
         let mut canvas = Canvas::new(w, h, BACK)?;
         for (i, q) in canvas.pixmap.pixels_mut().iter_mut().enumerate() {
@@ -51,16 +51,16 @@ impl<'a> Panel<'a> {
         Some(Self { canvas, zoom, lens: Lens::new(rig.rig.camera(view)), view, rig })
     }
 
-    fn raw(&self, p: Pixel) -> Pixel {
+    pub(in crate::offline) fn raw(&self, p: Pixel) -> Pixel {
         (p + Pixel::repeat(0.5)) * self.zoom
     }
 
-    fn space(&self, x: &Vec3) -> Option<Pixel> {
+    pub(in crate::offline) fn space(&self, x: &Vec3) -> Option<Pixel> {
         self.rig.rig.project(self.view, x).map(|p| self.raw(p))
     }
 
     /// A straight line in space, bent as the lens bends it.
-    fn line(&mut self, a: &Vec3, b: &Vec3, colour: Rgba, width: f64, dash: Option<[f64; 2]>) {
+    pub(in crate::offline) fn line(&mut self, a: &Vec3, b: &Vec3, colour: Rgba, width: f64, dash: Option<[f64; 2]>) {
         let points: Vec<_> = (0..=12).map(|k| self.space(&a.lerp(b, f64::from(k) / 12.0))).collect();
         self.canvas.line(&points, colour, width, dash);
     }
@@ -88,7 +88,7 @@ impl<'a> Panel<'a> {
     }
 
     /// The boxes of a gripper, the far ones first; solid faces or only their edges.
-    fn gripper(&mut self, boxes: &[(OrientedBox, [u8; 3])], solid: bool, unit: f64) {
+    pub(in crate::offline) fn gripper(&mut self, boxes: &[(OrientedBox, [u8; 3])], solid: bool, unit: f64) {
         let eye = self.rig.rig.centre(self.view);
         let mut order: Vec<_> = boxes.to_vec();
         let depth = |b: &OrientedBox| (b.frame_from_box.translation.vector - eye).norm();
@@ -132,7 +132,7 @@ impl<'a> Panel<'a> {
         }
     }
 
-    fn marks(&mut self, goal: &Goal, gripper: &GripperFile, unit: f64) {
+    pub(in crate::offline) fn marks(&mut self, goal: &Goal, gripper: &GripperFile, unit: f64) {
         let Some(seen) = goal.marks.get(self.view.index()) else { return };
         for (k, (mark, px)) in gripper.gripper.marks.iter().zip(seen).enumerate() {
             let Some(px) = px else { continue };
@@ -176,7 +176,7 @@ fn sample(p: &Picture, x: f64, y: f64) -> f64 {
 }
 
 /// Boxes of the gripper at a pose, fingers in another colour than the body.
-fn boxes(gripper: &GripperFile, opening: f64, pose: &Pose) -> Vec<(OrientedBox, [u8; 3])> {
+pub(in crate::offline) fn boxes(gripper: &GripperFile, opening: f64, pose: &Pose) -> Vec<(OrientedBox, [u8; 3])> {
     let fingers = gripper.fingers.len();
     gripper
         .boxes(opening)
@@ -196,30 +196,14 @@ fn heading(canvas: &mut Canvas, x: f64, y: f64, s: u32, parts: &[(&str, Rgba)]) 
 
 /// Draws a plan; the bytes of a PNG file. `None` only when the pictures are too large to be drawn.
 pub fn draw(plan: &Plan, pictures: [&Picture; 2], rig: &RigFile, gripper: &GripperFile) -> Option<Vec<u8>> {
-    // Each view about a thousand pixels wide, in half steps so that pixels stay alike.
-    let widest = pictures[0].width().max(pictures[1].width()) as f64;
-    let zoom = ((2.0 * 1100.0 / widest).round() / 2.0).clamp(0.5, 4.0);
-    let unit = (widest * zoom / 1100.0).max(0.6);
-    let scale = (unit.round() as u32).max(1);
+    let (zoom, unit) = scales(pictures);
     let mut panels = Vec::new();
     for (k, view) in View::BOTH.iter().enumerate() {
         panels.push(draw_view(plan, k, *view, pictures[k], rig, gripper, zoom, unit)?);
     }
-    let gap = (14.0 * unit) as u32;
-    let line = f64::from(22 * scale);
-    let top = (2.2 * line) as u32;
-    let rows = caption(plan);
-    let bottom =
-        (line * (rows.iter().map(Vec::len).max().unwrap_or(0) as f64 + 1.0 + plan.file.warnings.len() as f64)) as u32;
-    let width: u32 = panels.iter().map(|p| p.pixmap.width() + gap).sum::<u32>() + gap;
-    let height = panels.iter().map(|p| p.pixmap.height()).max()? + top + bottom + gap;
-    let mut canvas = Canvas::new(width, height, BACK)?;
-    let g = f64::from(gap);
-    heading(
-        &mut canvas,
-        g,
-        0.6 * line,
-        scale,
+    sheet(
+        &panels,
+        unit,
         &[
             ("graspd", RIM),
             ("  ", DIM),
@@ -230,9 +214,38 @@ pub fn draw(plan: &Plan, pictures: [&Picture; 2], rig: &RigFile, gripper: &Gripp
             ("  normal", NORMAL),
             ("  marks", MARK),
         ],
-    );
+        &caption(plan),
+        &plan.file.warnings,
+    )
+}
+
+/// Zoom of the pictures and the unit of strokes and letters: each view about a thousand pixels wide, in half steps so that pixels stay alike.
+pub(in crate::offline) fn scales(pictures: [&Picture; 2]) -> (f64, f64) {
+    let widest = pictures[0].width().max(pictures[1].width()) as f64;
+    let zoom = ((2.0 * 1100.0 / widest).round() / 2.0).clamp(0.5, 4.0);
+    (zoom, (widest * zoom / 1100.0).max(0.6))
+}
+
+/// Puts drawn views side by side under a legend, with columns of figures and the warnings below; the bytes of a PNG file.
+pub(in crate::offline) fn sheet(
+    panels: &[Canvas],
+    unit: f64,
+    legend: &[(&str, Rgba)],
+    rows: &[Vec<(&'static str, String)>],
+    warnings: &[String],
+) -> Option<Vec<u8>> {
+    let scale = (unit.round() as u32).max(1);
+    let gap = (14.0 * unit) as u32;
+    let line = f64::from(22 * scale);
+    let top = (2.2 * line) as u32;
+    let bottom = (line * (rows.iter().map(Vec::len).max().unwrap_or(0) as f64 + 1.0 + warnings.len() as f64)) as u32;
+    let width: u32 = panels.iter().map(|p| p.pixmap.width() + gap).sum::<u32>() + gap;
+    let height = panels.iter().map(|p| p.pixmap.height()).max()? + top + bottom + gap;
+    let mut canvas = Canvas::new(width, height, BACK)?;
+    let g = f64::from(gap);
+    heading(&mut canvas, g, 0.6 * line, scale, legend);
     let mut x = gap;
-    for p in &panels {
+    for p in panels {
         canvas.place(x as i32, top as i32, p);
         x += p.pixmap.width() + gap;
     }
@@ -254,7 +267,7 @@ pub fn draw(plan: &Plan, pictures: [&Picture; 2], rig: &RigFile, gripper: &Gripp
         }
     }
     let first = rows.iter().map(Vec::len).max().unwrap_or(0) as f64;
-    for (k, w) in plan.file.warnings.iter().enumerate() {
+    for (k, w) in warnings.iter().enumerate() {
         canvas.text(Pixel::new(g, y0 + (0.5 + first + k as f64) * line), &format!("! {w}"), Face::Plain, scale, RIM);
     }
     canvas.png()
@@ -263,9 +276,7 @@ pub fn draw(plan: &Plan, pictures: [&Picture; 2], rig: &RigFile, gripper: &Gripp
 /// Draws proposals, numbered, in both views.
 pub fn draw_proposals(found: &[Proposal], pictures: [&Picture; 2], rig: &RigFile) -> Option<Vec<u8>> {
     const COLOURS: [Rgba; 6] = [RIM, NORMAL, MARK, EDGE, [255, 140, 80, 255], [180, 160, 255, 255]];
-    let widest = pictures[0].width().max(pictures[1].width()) as f64;
-    let zoom = ((2.0 * 1100.0 / widest).round() / 2.0).clamp(0.5, 4.0);
-    let unit = (widest * zoom / 1100.0).max(0.6);
+    let (zoom, unit) = scales(pictures);
     let s = (unit.round() as u32).max(1);
     let mut panels = Vec::new();
     for (k, view) in View::BOTH.iter().enumerate() {

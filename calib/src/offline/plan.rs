@@ -302,6 +302,7 @@ fn assemble(
         selection: None,
         edges: Some(pair_of([0, 1].map(|k| edge_record(&contours[k])))),
         cones: Some(cone_record(&reconstruction)),
+        mesh: None,
         model: model_records(&reconstruction),
         candidate: grasp.candidates.clone(),
     };
@@ -354,7 +355,7 @@ fn rows<const R: usize, const C: usize>(m: &nalgebra::SMatrix<f64, R, C>) -> [[f
 }
 
 /// Largest standard deviation over all directions.
-fn worst<const N: usize>(m: &nalgebra::SMatrix<f64, N, N>) -> f64
+pub(super) fn worst<const N: usize>(m: &nalgebra::SMatrix<f64, N, N>) -> f64
 where
     nalgebra::Const<N>: nalgebra::DimName,
 {

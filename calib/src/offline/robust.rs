@@ -3,13 +3,19 @@
 //! A gate (truncated quadratic) at 3.5 robust standard deviations keeps 99.95 % of Gaussian noise, so that the estimate stays at the
 //! inliers' Cramer-Rao bound, and forgets everything farther away.
 
-use super::conic::{EllipseFit, FitError, fit_direct, fit_ml, refine};
+use super::conic::{EllipseFit, FitError, ellipse_of, fit_direct, fit_ml, refine};
 use super::model::{EdgePoint, Scatter};
 use super::sampson::distance;
 use nalgebra::Matrix3;
 
 /// The gate in robust standard deviations.
 pub const GATE: f64 = 3.5;
+
+/// The rest of a Gaussian cut off at the gate has a standard deviation smaller by this.
+const WIDEN: f64 = 1.003;
+
+/// Steps along the contour, in medians, within which a point needs two neighbours.
+const LONELY: f64 = 8.0;
 
 /// A median absolute deviation times this is a standard deviation for Gaussian noise.
 const MAD: f64 = 1.482_602_218_505_602;
@@ -103,16 +109,26 @@ fn consensus(points: &[EdgePoint], plain: Option<&EllipseFit>, samples: usize) -
 }
 
 /// Alternates gate and geometric fit until the set of inliers stands still.
+///
+/// The first scale is a median over all points, which outliers widen (by a third when one point in five is one); from then on it is that of
+/// the points kept, so that the gate closes to what the inliers themselves ask for.
 fn polish(points: &[EdgePoint], start: &Matrix3<f64>, scatter: Scatter) -> Result<RobustFit, FitError> {
     let mut conic = *start;
     let mut inliers = vec![false; points.len()];
-    let mut last = None;
-    for round in 0..15 {
+    let mut last: Option<EllipseFit> = None;
+    for round in 0..25 {
         let r = residuals(points, &conic);
         // Five points fit themselves: the first scale is widened for that (Rousseeuw's small-sample factor).
-        let scale = MAD * median(r.clone()) * (1.0 + 5.0 / (points.len() as f64 - 5.0).max(1.0));
-        let gate = (if round == 0 { 2.5 } else { GATE }) * scale.max(1e-9);
-        let next: Vec<bool> = r.iter().map(|x| *x <= gate).collect();
+        let first = MAD * median(r.clone()) * (1.0 + 5.0 / (points.len() as f64 - 5.0).max(1.0));
+        let (width, scale) = match &last {
+            None => (2.5, first),
+            Some(fit) => (GATE, (fit.noise * WIDEN).min(first)),
+        };
+        let gate = width * scale.max(1e-9);
+        let mut next: Vec<bool> = r.iter().map(|x| *x <= gate).collect();
+        if round > 0 {
+            drop_lonely(points, &conic, &mut next);
+        }
         let settled = round > 1 && next == inliers;
         inliers = next;
         if settled {
@@ -128,6 +144,42 @@ fn polish(points: &[EdgePoint], start: &Matrix3<f64>, scatter: Scatter) -> Resul
     }
     let fit = last.ok_or(FitError::NotAnEllipse)?;
     Ok(RobustFit { fit, inliers })
+}
+
+/// Drops points that stand alone in a gap of the contour.
+///
+/// Where part of the rim is hidden, a single stray point on the missing part bends the ellipse to itself and then lies within any gate: its
+/// residual says nothing. A contour's own points come in runs; one without two neighbours within a few steps has no witness.
+fn drop_lonely(points: &[EdgePoint], conic: &Matrix3<f64>, kept: &mut [bool]) {
+    let Some(e) = ellipse_of(conic) else { return };
+    let (s, c) = e.theta.sin_cos();
+    let mut around: Vec<(f64, usize)> = points
+        .iter()
+        .zip(kept.iter())
+        .enumerate()
+        .filter(|(_, (_, k))| **k)
+        .map(|(i, (p, _))| {
+            let d = p.uv - e.centre;
+            (((c * d.y - s * d.x) / e.b).atan2((c * d.x + s * d.y) / e.a), i)
+        })
+        .collect();
+    let n = around.len();
+    if n < 20 {
+        return;
+    }
+    around.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let at = |k: usize| points[around[k % n].1].uv;
+    let step: Vec<f64> = (0..n).map(|k| (at(k + 1) - at(k)).norm()).collect();
+    let far = LONELY * median(step.clone());
+    let gap = |k: usize| step[k % n];
+    for k in 0..n {
+        // The second nearest of the neighbours along the contour: two before, one on each side, or two after.
+        let (b1, a1) = (gap(k + n - 1), gap(k));
+        let (b2, a2) = (b1 + gap(k + n - 2), a1 + gap(k + 1));
+        if b2.min(a2).min(b1.max(a1)) > far {
+            kept[around[k].1] = false;
+        }
+    }
 }
 
 /// A small generator with a fixed seed, so that the same click always gives the same rim.
@@ -160,7 +212,7 @@ impl XorShift {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::offline::conic::{conic_of, ellipse_of};
+    use crate::offline::conic::conic_of;
     use crate::offline::model::Ellipse2;
     use nalgebra::Vector2;
 

@@ -21,7 +21,7 @@ pub struct Cli {
 pub enum Command {
     /// Run the whole chain against a simulated robot and simulated cameras, as separate processes
     Demo(DemoArgs),
-    /// Off line: from one click in each picture to a set-point (plan.toml) and an overlay
+    /// Off line: from one click in each picture, or a CAD mesh, to a set-point (plan.toml) and an overlay
     Plan(Box<PlanArgs>),
     /// On line: the real-time daemon; frames in, robot commands out
     Run(RunArgs),
@@ -122,17 +122,20 @@ pub struct StudyArgs {
     /// Seed of the study
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
+    /// Only the cells whose name holds this text
+    #[arg(long, value_name = "TEXT")]
+    pub cell: Option<String>,
 }
 
 /// `graspd plan`.
 #[derive(Debug, Args)]
 pub struct PlanArgs {
     /// Left picture (PNG, JPEG, PGM)
-    #[arg(long, value_name = "L.png")]
-    pub left: PathBuf,
+    #[arg(long, value_name = "L.png", required_unless_present = "mesh", requires = "right")]
+    pub left: Option<PathBuf>,
     /// Right picture
-    #[arg(long, value_name = "R.png")]
-    pub right: PathBuf,
+    #[arg(long, value_name = "R.png", required_unless_present = "mesh", requires = "left")]
+    pub right: Option<PathBuf>,
     /// Rig calibration
     #[arg(long, value_name = "rig.toml")]
     pub rig: PathBuf,
@@ -157,18 +160,25 @@ pub struct PlanArgs {
     /// Bar diameter in metres, where the operator knows it (round-bar rims)
     #[arg(long, value_name = "M")]
     pub bar_diameter: Option<f64>,
-    /// Distance of the pre-grasp pose from the object's plane, metres
-    #[arg(long, value_name = "M", default_value_t = 0.12)]
-    pub pregrasp: f64,
+    /// Distance of the pre-grasp pose from the object's plane, metres [default: 0.12, for a mesh 0.08 before the grasp]
+    #[arg(long, value_name = "M")]
+    pub pregrasp: Option<f64>,
     /// Distance of the grasp pose from the object's plane, metres
     #[arg(long, value_name = "M", default_value_t = 0.0, allow_hyphen_values = true)]
     pub standoff: f64,
-    /// Uncertainty of the centre that the task tolerates (one sigma), millimetres
-    #[arg(long, value_name = "MM", default_value_t = 1.0)]
-    pub tolerance_mm: f64,
-    /// Uncertainty of the normal that the task tolerates (one sigma), degrees
-    #[arg(long, value_name = "DEG", default_value_t = 0.5)]
-    pub tolerance_deg: f64,
+    /// Uncertainty of the place that the task tolerates (one sigma), millimetres [default: 1, for a mesh 3]
+    #[arg(long, value_name = "MM")]
+    pub tolerance_mm: Option<f64>,
+    /// Uncertainty of the axis that the task tolerates (one sigma), degrees [default: 0.5, for a mesh 2]
+    #[arg(long, value_name = "DEG")]
+    pub tolerance_deg: Option<f64>,
+    /// Where the gripper is now in the left camera's frame: a pose file, or X,Y,Z,RX,RY,RZ (metres, rotation vector in
+    /// radians). Checks the path's visibility, and decides angles that the marks leave open by the smallest turn
+    #[arg(long, value_name = "POSE", allow_hyphen_values = true)]
+    pub present: Option<String>,
+    /// Largest turn from the present pose, degrees
+    #[arg(long, value_name = "DEG", requires = "present")]
+    pub max_turn: Option<f64>,
     /// Allowance for the rig's calibration error in the two-view test, pixels
     #[arg(long, value_name = "PX")]
     pub calibration_px: Option<f64>,
@@ -179,11 +189,14 @@ pub struct PlanArgs {
     #[arg(long, value_name = "plan.png")]
     pub overlay: Option<PathBuf>,
     /// Where to write a one-page report
-    #[arg(long, value_name = "plan.html")]
+    #[arg(long, value_name = "plan.html", conflicts_with = "mesh")]
     pub report: Option<PathBuf>,
     /// One JSON object on standard output
     #[arg(long)]
     pub json: bool,
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub part: super::mesh::MeshArgs,
 }
 
 /// `graspd demo`.

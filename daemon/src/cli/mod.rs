@@ -4,6 +4,7 @@ mod args;
 mod client;
 #[cfg(feature = "demo")]
 pub mod demo;
+mod mesh;
 mod plan;
 mod reconstruct;
 mod run;
@@ -14,6 +15,7 @@ pub use args::{
     Cli, ClientArgs, Command, DemoArgs, PassThrough, PlanArgs, ReconstructArgs, RunArgs, SetpointArgs, StudyArgs,
 };
 pub use client::{send, setpoint};
+pub use mesh::MeshArgs;
 pub use plan::plan;
 pub use reconstruct::reconstruct;
 pub use run::{check, run};

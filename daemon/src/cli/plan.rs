@@ -1,17 +1,33 @@
-//! `graspd plan`: the off-line stage on two pictures.
+//! `graspd plan`: the off-line stage, on a contour in two pictures or on a CAD mesh.
 
 use super::args::PlanArgs;
 use crate::exit::{Exit, Failure};
-use graspd_calib::plan_cli::{Class, Request, run};
+use graspd_calib::mesh_cli::parse_pose;
+use graspd_calib::plan_cli::{Class, Outcome, Request, run};
 
 /// Runs it.
 ///
 /// # Errors
 /// Usage (2), a file or selection that is wrong (3), a rim or grasp that the tests refuse (1). Nothing is written then.
 pub fn plan(args: &PlanArgs) -> Result<Exit, Failure> {
+    if args.part.mesh.is_some() {
+        return finish(args, super::mesh::plan(args));
+    }
+    let present = args
+        .present
+        .as_deref()
+        .map(|t| parse_pose("--present", t, "left_from_gripper"))
+        .transpose()
+        .map_err(|e| Failure::input(e.to_string()))?;
+    let max_turn = match args.max_turn {
+        Some(deg) if !(0.0..=180.0).contains(&deg) => {
+            return Err(Failure { exit: Exit::Usage, message: format!("--max-turn {deg}: give 0 to 180 degrees") });
+        }
+        deg => deg.map(f64::to_radians),
+    };
     let outcome = run(&Request {
-        left: args.left.clone(),
-        right: args.right.clone(),
+        left: args.left.clone().unwrap_or_default(),
+        right: args.right.clone().unwrap_or_default(),
         rig: args.rig.clone(),
         gripper: args.gripper.clone(),
         select_left: args.select_left.clone(),
@@ -20,17 +36,22 @@ pub fn plan(args: &PlanArgs) -> Result<Exit, Failure> {
         pick: args.pick,
         rim: args.rim.clone(),
         bar_diameter: args.bar_diameter,
-        pregrasp: Some(args.pregrasp),
+        pregrasp: args.pregrasp,
         standoff: Some(args.standoff),
-        tolerance_mm: Some(args.tolerance_mm),
-        tolerance_deg: Some(args.tolerance_deg),
+        tolerance_mm: Some(args.tolerance_mm.unwrap_or(1.0)),
+        tolerance_deg: Some(args.tolerance_deg.unwrap_or(0.5)),
         calibration_px: args.calibration_px,
-        present: None,
-        max_turn: None,
+        present,
+        max_turn,
         out: args.out.clone(),
         overlay: args.overlay.clone(),
         report: args.report.clone(),
     });
+    finish(args, outcome)
+}
+
+/// Prints what came out; the class says with which code the program ends.
+fn finish(args: &PlanArgs, outcome: Outcome) -> Result<Exit, Failure> {
     if args.json {
         println!("{}", outcome.json);
     }

@@ -1,6 +1,6 @@
 //! Parts with a CAD model (paper section 3.1): every box handle that parallel claws could take, and which of them can be taken here.
 //!
-//! [`Mesh`] reads STL and OBJ. [`faces`] finds its flat faces, [`handles`] enumerates the pairs that two claws can oppose with every way of coming in,
+//! [`read`] reads STL and OBJ into a [`Mesh`], and [`topology`] mends its windings. [`faces`] finds its flat faces, [`handles`] enumerates the pairs that two claws can oppose with every way of coming in,
 //! and [`filter`] drops those that this gripper, from here, cannot take, each with its reason. [`pose`] places the mesh from picked points.
 
 pub mod bvh;
@@ -8,7 +8,13 @@ pub mod faces;
 pub mod filter;
 pub mod handles;
 mod mesh;
+mod obj;
+pub mod overlay;
 pub mod plan;
 pub mod pose;
+pub mod reach;
+pub mod read;
+mod stl;
+pub mod topology;
 
 pub use mesh::Mesh;

@@ -51,8 +51,56 @@ pub enum PickError {
 
 /// Fits the mesh's pose to picked points: triangulation and the closed form of Horn, then least squares on all pixels.
 pub fn fit(rig: &Rig, picked: &[Picked], limit_px: f64) -> Result<MeshPose, PickError> {
+    let (pose, information) = solve(rig, picked)?;
+    let mut sum = 0.0;
+    let (mut worst, mut most) = (0, 0.0f64);
+    for (k, p) in picked.iter().enumerate() {
+        for e in errors(rig, &pose, p) {
+            sum += e * e;
+            if !(e <= most) {
+                (worst, most) = (k + 1, e);
+            }
+        }
+    }
+    if !(most <= limit_px) {
+        // One wrong pick pulls the pose to itself and makes others look worse: the one without which the rest agree best is meant.
+        let without = |k: usize| {
+            let rest: Vec<Picked> = picked.iter().enumerate().filter(|(i, _)| *i != k).map(|(_, p)| *p).collect();
+            let pose = solve(rig, &rest).ok()?.0;
+            let rms = rest.iter().flat_map(|p| errors(rig, &pose, p)).map(|e| e * e).sum::<f64>();
+            let own = picked.get(k).map_or(0.0, |p| errors(rig, &pose, p).into_iter().fold(0.0, f64::max));
+            Some((rms, k, own))
+        };
+        let culprit = (0..picked.len()).filter_map(without).min_by(|a, b| a.0.total_cmp(&b.0));
+        let (worst, error_px) = match culprit {
+            Some((_, k, own)) if picked.len() > 4 => (k + 1, own),
+            _ => (worst, most),
+        };
+        return Err(PickError::Outlier { worst, error_px, limit_px });
+    }
+    let dof = (4 * picked.len()).saturating_sub(6).max(1) as f64;
+    let sigma2 = (sum / dof).max(1.0);
+    let covariance = information.try_inverse().ok_or(PickError::Degenerate("they lie on one line"))? * sigma2;
+    Ok(MeshPose { left_from_mesh: pose, rms_px: (sum / (2.0 * picked.len() as f64)).sqrt(), covariance })
+}
+
+/// Distances of a pick's pixels from where a pose puts its point, left and right.
+fn errors(rig: &Rig, pose: &Pose, p: &Picked) -> [f64; 2] {
+    let x = (pose * Point3::from(p.point)).coords;
+    [(View::Left, p.left), (View::Right, p.right)]
+        .map(|(view, px)| rig.project(view, &x).map_or(f64::INFINITY, |q| (q - px).norm()))
+}
+
+/// The pose, and the information of a small body motion for pixels of unit noise.
+fn solve(rig: &Rig, picked: &[Picked]) -> Result<(Pose, Matrix6<f64>), PickError> {
     if picked.len() < 3 {
         return Err(PickError::TooFew(picked.len()));
+    }
+    if picked
+        .iter()
+        .any(|p| ![p.left.x, p.left.y, p.right.x, p.right.y].iter().chain(p.point.iter()).all(|v| v.is_finite()))
+    {
+        return Err(PickError::Degenerate("a number is not finite"));
     }
     let lenses = View::BOTH.map(|v| Lens::new(rig.camera(v)));
     let seen: Vec<Vec3> = picked
@@ -91,25 +139,7 @@ pub fn fit(rig: &Rig, picked: &[Picked], limit_px: f64) -> Result<MeshPose, Pick
             break;
         }
     }
-    let mut sum = 0.0;
-    let (mut worst, mut most) = (0, 0.0f64);
-    for (k, p) in picked.iter().enumerate() {
-        let x = (pose * Point3::from(p.point)).coords;
-        for (view, px) in [(View::Left, p.left), (View::Right, p.right)] {
-            let e = rig.project(view, &x).map_or(f64::INFINITY, |q| (q - px).norm());
-            sum += e * e;
-            if e > most {
-                (worst, most) = (k + 1, e);
-            }
-        }
-    }
-    if !(most <= limit_px) {
-        return Err(PickError::Outlier { worst, error_px: most, limit_px });
-    }
-    let dof = (4 * picked.len()).saturating_sub(6).max(1) as f64;
-    let sigma2 = (sum / dof).max(1.0);
-    let covariance = information.try_inverse().ok_or(PickError::Degenerate("they lie on one line"))? * sigma2;
-    Ok(MeshPose { left_from_mesh: pose, rms_px: (sum / (2.0 * picked.len() as f64)).sqrt(), covariance })
+    Ok((pose, information))
 }
 
 /// The point nearest to both viewing rays, in the left frame.
