@@ -32,7 +32,9 @@ pub enum Error {
 /// # Errors
 /// Only when the file as a whole is unusable: not JSON, or without a list of cases.
 pub fn reconstruct_file(cases_json: &str) -> Result<String, Error> {
-    let file: Value = serde_json::from_str(&finite_numbers(cases_json))?;
+    // Some editors begin a file with a mark of its encoding.
+    let text = cases_json.strip_prefix('\u{feff}').unwrap_or(cases_json);
+    let file: Value = serde_json::from_str(&finite_numbers(text))?;
     let cases = file.get("cases").and_then(Value::as_array).ok_or(Error::NoCases)?;
     let gripper = match file.get("gripper") {
         None | Some(Value::Null) => Ok(None),
@@ -192,21 +194,30 @@ fn options(sigma: f64) -> Options {
 fn scatter(points: &[Vec<EdgePoint>; 2]) -> Scatter {
     let across = points.iter().all(|list| {
         let Ok(fit) = fit_ml(list, Scatter::Isotropic) else { return false };
-        let feet: Vec<Vector2<f64>> = list
-            .iter()
-            .map(|p| {
-                let g = fit.conic * Vector3::new(p.uv.x, p.uv.y, 1.0);
-                p.uv - Vector2::new(g.x, g.y).normalize() * distance(&fit.conic, &p.uv)
-            })
-            .collect();
+        let feet: Vec<Vector2<f64>> = list.iter().map(|p| foot(&fit.conic, &p.uv)).collect();
         let steps: Vec<f64> = feet.windows(2).map(|w| (w[1] - w[0]).norm()).collect();
         let jumps: Vec<f64> = steps.windows(2).map(|w| w[1] - w[0]).collect();
         let along = (jumps.iter().map(|j| j * j).sum::<f64>() / (6.0 * jumps.len().max(1) as f64)).sqrt();
         let scattered =
             (list.iter().map(|p| distance(&fit.conic, &p.uv).powi(2)).sum::<f64>() / list.len() as f64).sqrt();
-        list.len() >= 20 && along < 0.25 * scattered
+        // One step's length scatters by a fifth where there are twenty of them.
+        list.len() >= 20 && along < 0.4 * scattered
     });
     if across { Scatter::Across } else { Scatter::Isotropic }
+}
+
+/// The point of a conic nearest to a pixel, by a few tangents: the gradient at the pixel itself points elsewhere where the curve is tight.
+fn foot(conic: &Matrix3<f64>, uv: &Vector2<f64>) -> Vector2<f64> {
+    let normal = |q: &Vector2<f64>| {
+        let g = conic * Vector3::new(q.x, q.y, 1.0);
+        Vector2::new(g.x, g.y).try_normalize(1e-300).unwrap_or_default()
+    };
+    let mut foot = uv - normal(uv) * distance(conic, uv);
+    for _ in 0..3 {
+        let n = normal(&foot);
+        foot = uv - n * (n.dot(&(uv - foot)) + distance(conic, &foot));
+    }
+    foot
 }
 
 fn reconstruct_case(case: &Case, marks: Option<&[FlatMark]>) -> Result<Map<String, Value>, String> {

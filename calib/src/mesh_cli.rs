@@ -256,9 +256,7 @@ fn work(r: &MeshRequest) -> Result<Outcome, Failure> {
             }
         }
     }
-    let follows = |from: &Pose, to: &Pose| arm.as_ref().is_none_or(|a| a.follows(from, to));
-    let reach: Option<&dyn Fn(&Pose, &Pose) -> bool> = if arm.is_some() { Some(&follows) } else { None };
-    let found = survey(&m.mesh, &placed.left_from_mesh, &rig, &gripper, reach, &options);
+    let found = survey(&m.mesh, &placed.left_from_mesh, &rig, &gripper, arm.as_ref(), &options);
     let handles: Vec<Value> = found.handles.iter().enumerate().map(|(k, j)| row(k, j)).collect();
     if r.list {
         let mut text = summary(&m, &found);

@@ -42,7 +42,7 @@ impl Folder {
         std::fs::create_dir_all(&path).unwrap();
         let f = Self(path);
         f.write("rig.toml", RIG);
-        f.write("gripper.toml", &gripper(0.08));
+        f.write("gripper.toml", gripper(0.08));
         f
     }
 

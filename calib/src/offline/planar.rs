@@ -89,8 +89,9 @@ fn fit_view(points: &[EdgePoint], view: View, options: &Options) -> Result<Robus
     if minor < options.min_minor_axis_px {
         return Err(Refusal::EdgeOn { view, minor_px: minor, limit_px: options.min_minor_axis_px });
     }
-    // Scatter of a tenth of the minor axis is not the noise of one contour, however large the contour.
-    let limit_px = options.max_noise_px.min(0.1 * minor);
+    // Scatter of a tenth of the minor axis is not the noise of one contour, however large the contour; unless the points say that they are so noisy.
+    let stated = if options.noise == Noise::AtLeastGiven { 2.0 * typical_sigma(points) } else { 0.0 };
+    let limit_px = options.max_noise_px.min((0.1 * minor).max(stated));
     if !(sigma_px <= limit_px) {
         return Err(Refusal::Scattered { view, sigma_px, limit_px });
     }

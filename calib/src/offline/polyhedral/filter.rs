@@ -2,6 +2,7 @@
 
 use super::bvh::Bvh;
 use super::handles::{BoxHandle, Handles, Overlap};
+use super::reach::Arm;
 use crate::files::{GripperFile, OrientedBox};
 use crate::offline::grasp::LEAST_MARKS;
 use crate::offline::setpoint::{Obstacle, Scene};
@@ -20,8 +21,8 @@ pub struct Situation<'a> {
     pub approach_length: f64,
     /// Smallest contact of each claw, square metres.
     pub contact: f64,
-    /// Whether the arm can bring the gripper from one pose of the left frame straight to another. Without it every pose counts as within reach.
-    pub reach: Option<&'a dyn Fn(&Pose, &Pose) -> bool>,
+    /// The arm. Without it every pose counts as within reach.
+    pub reach: Option<&'a Arm>,
     /// Where the gripper is now in the left frame, if known.
     pub present: Option<Pose>,
     /// Largest turn from there, radians.
@@ -322,7 +323,7 @@ fn see_and_reach(j: &mut Judged, tree: &Bvh<'_>, gripper: &GripperFile, s: &Situ
             return;
         }
     }
-    poses.retain(|p| s.reach.is_none_or(|f| f(&(s.left_from_mesh * p * back), &(s.left_from_mesh * p))));
+    poses.retain(|p| s.reach.is_none_or(|a| a.follows(&(s.left_from_mesh * p * back), &(s.left_from_mesh * p))));
     if poses.is_empty() {
         j.reason = Some(Reason::Reach);
         return;

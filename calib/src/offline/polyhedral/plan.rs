@@ -5,6 +5,7 @@ use super::faces::{Flatness, faces};
 use super::filter::{Judged, MeshObstacle, Situation, judge};
 use super::handles::{Opposition, enumerate};
 use super::mesh::Mesh;
+use super::reach::Arm;
 use crate::files::{
     CandidateRecord, FileError, GripRecord, GripperFile, MeshRecord, ObjectRecord, PathRecord, PlanFile, PoseRecord,
     RigFile, SourceRecord,
@@ -148,13 +149,13 @@ pub enum MeshPlanError {
     },
 }
 
-/// Finds and judges every handle of a mesh at a known pose. `reach` says whether the arm can go straight from one pose to another.
+/// Finds and judges every handle of a mesh at a known pose. With an arm, only what it can reach.
 pub fn survey<'a>(
     mesh: &'a Mesh,
     left_from_mesh: &Pose,
     rig: &RigFile,
     gripper: &GripperFile,
-    reach: Option<&dyn Fn(&Pose, &Pose) -> bool>,
+    reach: Option<&Arm>,
     options: &MeshOptions,
 ) -> Survey<'a> {
     let tree = Bvh::new(mesh);

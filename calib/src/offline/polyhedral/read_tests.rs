@@ -88,7 +88,7 @@ fn broken_files_are_refused_with_place_and_reason() {
         (with(84 + 24, &f32::INFINITY.to_le_bytes()), "stl", "byte 84: triangle 0"),
         (binary(&vec![]), "stl", "no triangle"),
         (binary(&vec![[[1.0; 3]; 3]]), "stl", "has an area"),
-        (t[..t.len() / 2].as_bytes().to_vec(), "stl", "line "),
+        (t.as_bytes()[..t.len() / 2].to_vec(), "stl", "line "),
         (t.replace("endsolid cube\n", "").into_bytes(), "stl", "ends inside a solid"),
         (t.replacen("vertex -2e1", "vertex nan", 1).into_bytes(), "stl", "line 4: \"vertex nan"),
         (
