@@ -178,7 +178,7 @@ fn neither_real_time_thread_touches_the_heap_while_servoing_or_stopping() {
     operator.insist(Verb::Setpoint, &plan);
 
     // What the fault is, who makes it, and the reason that has to be named.
-    let table: [(Way, &str); 20] = [
+    let table: [(Way, &str); 22] = [
         (Way::Mock(r#"{"cmd":"protective_stop"}"#), "F-ARM-05"),
         (Way::Mock(r#"{"cmd":"emergency_stop"}"#), "F-ARM-06"),
         (Way::Mock(r#"{"cmd":"safeguard_stop"}"#), "F-ARM-07"),
@@ -196,7 +196,9 @@ fn neither_real_time_thread_touches_the_heap_while_servoing_or_stopping() {
         (Way::Mock(r#"{"cmd":"speed_slider","fraction":0.0}"#), "H-06"),
         (Way::Scene(r#"{"fault":"stop"}"#), "F-CAM-01"),
         (Way::Scene(r#"{"fault":"header","field":"stride","value":7}"#), "F-CAM-01"),
-        (Way::Scene(r#"{"fault":"skew","ms":9}"#), "-"),
+        (Way::Scene(r#"{"fault":"header","field":"calibration_id","value":7}"#), "another calibration"),
+        (Way::Scene(r#"{"fault":"freeze"}"#), "F-"),
+        (Way::Scene(r#"{"fault":"skew","ms":9}"#), "exposed too far apart"),
         (Way::Scene(r#"{"fault":"hide_gripper"}"#), "H-01"),
         (Way::Scene(r#"{"fault":"white_noise"}"#), "H-01"),
         (Way::Scene(r#"{"fault":"teleport","mm":60}"#), "-"),

@@ -10,6 +10,7 @@
 
 mod acquire;
 mod command;
+mod refusal;
 mod report;
 mod service;
 mod shared;
@@ -20,6 +21,7 @@ mod vision;
 
 pub use acquire::{AcquireReport, run as run_acquire};
 pub use command::CommandWorker;
+pub use refusal::Refusal;
 pub use report::Report;
 pub use service::Service;
 pub use shared::{JointSample, Seed, Shared, VisionCounters};

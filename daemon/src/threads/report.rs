@@ -15,6 +15,7 @@ struct State {
     link: String,
     refused: Vec<String>,
     plan: String,
+    refusal: String,
     sample: TelemetrySample,
     rest: bool,
 }
@@ -77,6 +78,11 @@ impl Report {
         }
     }
 
+    /// Notes why pictures are being refused; empty when they are not.
+    pub fn refusal(&self, words: &str) {
+        words.clone_into(&mut self.lock().refusal);
+    }
+
     /// Notes what the host refused.
     pub fn refused(&self, what: &[String]) {
         for line in what {
@@ -124,6 +130,7 @@ impl Report {
             "frames": t.frames,
             "frames_skipped": t.frames_skipped,
             "frames_refused": t.frames_refused,
+            "frames_refused_because": s.refusal,
             "error_px": number(t.error_px),
             "residual_px": number(t.residual_px),
             "distance_m": number(t.distance_m),

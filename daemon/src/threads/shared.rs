@@ -10,7 +10,7 @@ use graspd_rt::geom::Pose;
 use graspd_rt::mode::Reject;
 use graspd_rt::online::Vision;
 use graspd_rt::setpoint::SetPoint;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 
 /// Joint positions at an instant, from the command thread to the vision thread.
 #[derive(Clone, Copy, Debug)]
@@ -41,6 +41,8 @@ pub struct VisionCounters {
     pub refused: AtomicU64,
     /// Acquisitions taken over.
     pub acquired: AtomicU64,
+    /// Why the last pair was refused, as [`super::refusal::Refusal::number`] gives it; 0 before the first one.
+    pub refusal: AtomicU32,
 }
 
 /// Everything the threads share.

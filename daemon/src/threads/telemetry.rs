@@ -1,19 +1,20 @@
 //! The telemetry thread: drains what the loop noted, keeps latency histograms, publishes 50 samples a second, logs changes of mode.
 //! An ordinary thread: formatting, histograms and iceoryx2's send stay off the loop.
 
+use super::refusal::Refusal;
 use super::report::Report;
 use super::shared::Shared;
 use super::timing::Latency;
 use crate::config::Config;
 use graspd_rt::cycle::{CycleRecord, Stage, Transition, Why};
 use graspd_rt::gripper::MAX_MARKS;
-use graspd_rt::mode::ModeName;
+use graspd_rt::mode::{FaultCause, ModeName};
 use graspd_rt::online::Vision;
 use graspd_rt::setpoint::{Goal, SetPoint};
 use graspd_shm::ShmNode;
 use graspd_shm::control::{ControlError, TelemetryPublisher, TelemetrySample};
 use std::sync::atomic::Ordering;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// What the command thread notes about one beat.
 #[derive(Clone, Copy, Debug)]
@@ -88,8 +89,11 @@ pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &Report) ->
     };
     let mut setpoint: Option<SetPoint> = None;
     let mut settled = false;
+    let mut refusal = (0, 0, Instant::now());
+    let mut refused = String::new();
     loop {
         let ending = shared.ending();
+        refusals(shared, report, &mut refusal, &mut refused);
         let mut last = None;
         while let Some(beat) = shared.records.pop() {
             // Percentiles are of the loop in service: from the first arming on, and afresh with each.
@@ -99,7 +103,10 @@ pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &Report) ->
             }
             note(&mut latencies, &beat);
             if let Some(event) = beat.event {
-                let why = why_words(&event.why);
+                let mut why = why_words(&event.why);
+                if let (Why::Fault(FaultCause::FramesStale { .. }), false) = (event.why, refused.is_empty()) {
+                    why = format!("{why}; pictures were refused: {refused}");
+                }
                 eprintln!("graspd: {} -> {}: {why}", event.from.as_str(), event.to.as_str());
                 report.transition(&event, &why);
                 match event.why {
@@ -144,6 +151,24 @@ pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &Report) ->
             return Ok(());
         }
         std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// Says once why pictures are refused. `seen` is the count, the reason and the time of the last refusal; `words` are those of the last
+/// second, for the fault that may follow.
+fn refusals(shared: &Shared, report: &Report, seen: &mut (u64, u32, Instant), words: &mut String) {
+    let count = shared.counters.refused.load(Ordering::Relaxed);
+    let why = shared.counters.refusal.load(Ordering::Relaxed);
+    if count != seen.0 {
+        if why != seen.1 || words.is_empty() {
+            *words = Refusal::words(why);
+            eprintln!("graspd: pictures are refused: {words}");
+            report.refusal(words);
+        }
+        *seen = (count, why, Instant::now());
+    } else if seen.2.elapsed() > Duration::from_secs(1) && !words.is_empty() {
+        words.clear();
+        report.refusal("");
     }
 }
 

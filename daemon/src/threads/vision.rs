@@ -1,5 +1,6 @@
 //! The vision thread: newest pair, track, gripper pose. It owns the frame subscriber, and nothing it does can delay the arm's beat.
 
+use super::refusal::Refusal;
 use super::shared::{Seed, Shared};
 use crate::config::Config;
 use crate::realtime::{Beat, now_ns};
@@ -11,6 +12,19 @@ use graspd_rt::online::{FrameLimits, StereoFrame, VisionCycle, VisionSettings};
 use graspd_shm::frame::{FramePolicy, FrameSubscriber, SourceEvent};
 use graspd_shm::{ShmError, ShmNode};
 use std::sync::atomic::Ordering;
+
+/// Equal pictures in a row that are no accident any more.
+const FROZEN_FRAMES: u32 = 5;
+/// Joint motion within the last tenth of a second that a picture has to show, rad.
+const SEEN_MOTION: f64 = 1e-3;
+
+/// Whether the arm moved before `at_ns`, by its encoders.
+fn moves(history: &JointHistory, at_ns: u64) -> bool {
+    let (Some(now), Some(then)) = (history.at(at_ns), history.at(at_ns.saturating_sub(100_000_000))) else {
+        return false;
+    };
+    now.iter().zip(then).any(|(a, b)| (a - b).abs() > SEEN_MOTION)
+}
 
 /// The vision thread's state; made on the thread that runs it.
 #[derive(Debug)]
@@ -30,7 +44,12 @@ pub struct VisionWorker<'a> {
 /// What the frame topic has to carry for this rig.
 pub fn policy(config: &Config) -> FramePolicy {
     let rig = &config.rig.rig;
-    FramePolicy { size: Some((rig.left.width, rig.left.height)), ..FramePolicy::default() }
+    FramePolicy {
+        size: Some((rig.left.width, rig.left.height)),
+        // A driver that says which calibration it was set up with has to mean this one (G08).
+        calibration: config.rig.id(),
+        ..FramePolicy::default()
+    }
 }
 
 impl<'a> VisionWorker<'a> {
@@ -79,7 +98,14 @@ impl<'a> VisionWorker<'a> {
         let received = subscriber.newest(now);
         let counters = &shared.counters;
         counters.skipped.fetch_add(received.skipped, Ordering::Relaxed);
-        counters.refused.fetch_add(u64::from(received.rejected), Ordering::Relaxed);
+        if let Some(reject) = received.last_reject {
+            counters.refused.fetch_add(u64::from(received.rejected), Ordering::Relaxed);
+            counters.refusal.store(Refusal::Topic(reject).number(), Ordering::Relaxed);
+        }
+        let refuse = |why: Refusal| {
+            counters.refused.fetch_add(1, Ordering::Relaxed);
+            counters.refusal.store(why.number(), Ordering::Relaxed);
+        };
         if matches!(received.source, Some(SourceEvent::First | SourceEvent::TakenOver)) {
             cycle.reset();
             *last = None;
@@ -97,14 +123,14 @@ impl<'a> VisionWorker<'a> {
             ok.then_some((w, false))
         };
         let (Some(l), Some(r)) = (view(0), view(1)) else {
-            counters.refused.fetch_add(1, Ordering::Relaxed);
+            refuse(Refusal::Pictures);
             return;
         };
         let bytes =
             |eye: usize, direct: bool| if direct { frame.mono8(eye).unwrap_or(&[]) } else { &converted[eye][..] };
         let pictures = (ImageView::new(bytes(0, l.1), w, h, l.0), ImageView::new(bytes(1, r.1), w, h, r.0));
         let (Some(left), Some(right)) = pictures else {
-            counters.refused.fetch_add(1, Ordering::Relaxed);
+            refuse(Refusal::Pictures);
             return;
         };
         let capture = frame.capture_ns();
@@ -122,6 +148,8 @@ impl<'a> VisionWorker<'a> {
         let prior = last.as_ref().and_then(|(at, pose)| moved(*at, pose));
         let pair = StereoFrame { left, right, sequence: frame.sequence(), capture_ns: capture, now_ns: now };
         match cycle.step(&pair, prior) {
+            // What the pictures say is then old, whatever their stamps say: let it age.
+            Ok(_) if cycle.health().frozen_run >= FROZEN_FRAMES && moves(history, middle) => refuse(Refusal::Frozen),
             Ok(vision) => {
                 *last = (vision.status != graspd_rt::online::VisionStatus::Lost)
                     .then_some((middle, vision.left_from_gripper));
@@ -129,9 +157,7 @@ impl<'a> VisionWorker<'a> {
                 shared.vision.put(vision);
                 shared.vision_seen.put(vision);
             }
-            Err(_) => {
-                counters.refused.fetch_add(1, Ordering::Relaxed);
-            }
+            Err(reject) => refuse(Refusal::Tracker(reject)),
         }
         shared.needs_seed.store(cycle.needs_acquisition(), Ordering::Release);
     }
