@@ -3,6 +3,8 @@
 //! Prints percentiles; nothing passes or fails by them. `cargo bench -p graspd-rt --bench command_step`
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
+#[path = "../tests/closed_loop/heap.rs"]
+mod heap;
 #[allow(dead_code)]
 #[path = "../tests/closed_loop/world.rs"]
 mod world;
