@@ -214,9 +214,12 @@ pub struct DemoArgs {
     /// Where pictures, plan and recordings go
     #[arg(long, value_name = "DIR", default_value = "graspd-demo")]
     pub out: PathBuf,
-    /// Views that close the loop: stereo, left, right, best
-    #[arg(long, default_value = "stereo")]
+    /// Views that close the loop; best is the paper's: the one view that shows the marks best
+    #[arg(long, default_value = "stereo", value_parser = ["stereo", "left", "right", "best"])]
     pub views: String,
+    /// Stereo pairs a second that the simulated cameras take
+    #[arg(long, value_name = "HZ", default_value_t = 60.0)]
+    pub frame_rate: f64,
     /// The arm's true kinematics differ from the model: MM,DEG on every link
     #[arg(long, value_name = "MM,DEG")]
     pub kinematics_error: Option<String>,

@@ -6,7 +6,7 @@ use crate::exit::{Exit, Failure};
 use graspd_hil::scenario::{Options, Scenario};
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// How long a part may take to be ready: the scene renders its fixed layers first.
 const READY: Duration = Duration::from_secs(40);
@@ -26,6 +26,8 @@ pub(super) struct Cell {
     pub world: PathBuf,
     /// What was drawn.
     pub scenario: Scenario,
+    /// Pairs the scene had published, and when, as first asked.
+    published: Option<(u64, Instant)>,
 }
 
 fn two(text: &str, key: &str) -> Result<[f64; 2], Failure> {
@@ -111,7 +113,7 @@ impl Cell {
             "--rtde",
             &format!("{address}:30004"),
             "--rate",
-            "60",
+            &args.frame_rate.to_string(),
             "--shm-root",
             &s(&shm),
             "--cell",
@@ -127,7 +129,16 @@ impl Cell {
         })?;
         let mut daemon = Part::start("graspd", &["run".to_owned(), "--config".to_owned(), s(&config)], folder)?;
         daemon.json_line(READY)?;
-        Ok(Self { daemon, scene, mock, config, world, scenario })
+        Ok(Self { daemon, scene, mock, config, world, scenario, published: None })
+    }
+
+    /// Pairs a second that the scene published since this was asked last; `None` the first time, or when it does not say.
+    pub(super) fn pairs_per_second(&mut self) -> Option<f64> {
+        let said = self.scene.ask(r#"{"ask":"status"}"#, Duration::from_secs(3)).ok()?;
+        let now = (said.get("published")?.as_u64()?, Instant::now());
+        let before = self.published.replace(now)?;
+        let seconds = now.1.duration_since(before.1).as_secs_f64();
+        (seconds > 0.0).then(|| now.0.saturating_sub(before.0) as f64 / seconds)
     }
 
     /// Names the part that ended although nobody asked it to.
@@ -142,7 +153,8 @@ fn config_text(args: &DemoArgs, cell: &str, address: &str, model: &str) -> Strin
     format!(
         "# Written by graspd demo.\ncell = \"{cell}\"\n\n[files]\nrig = \"world/rig.toml\"\ngripper = \"world/gripper.toml\"\n\n\
          [shm]\nroot = \"shm\"\n\n[arm]\nlink = \"rtde\"\naddress = \"{address}\"\nmodel = \"{model}\"\n\
-         kinematics = \"world/arm.toml\"\n\n# A simulated world shares its processors with the daemon.\n[loop]\nbest_effort = true\n\n[servo]\nviews = \"{}\"\n",
-        args.views
+         kinematics = \"world/arm.toml\"\n\n# A simulated world shares its processors with the daemon.\n[loop]\nbest_effort = true\n\n\
+         [vision]\nframe_rate_hz = {:?}\n\n[servo]\nviews = \"{}\"\n",
+        args.frame_rate, args.views
     )
 }

@@ -33,6 +33,12 @@ pub fn run(args: &DemoArgs) -> Result<Exit, Failure> {
             message: format!("--timeout {}: give a number of seconds", args.timeout),
         });
     }
+    if !(10.0..=200.0).contains(&args.frame_rate) {
+        return Err(Failure {
+            exit: Exit::Usage,
+            message: format!("--frame-rate {}: give 10 to 200 pairs a second", args.frame_rate),
+        });
+    }
     let shown = args.out.display();
     let wrong =
         |e: std::io::Error| Failure::input(format!("{shown}: cannot be used ({e}); choose another folder with --out"));
@@ -63,6 +69,7 @@ pub fn run(args: &DemoArgs) -> Result<Exit, Failure> {
     ask(&client, Verb::Arm, b"")?;
     ask(&client, Verb::Servo, b"")?;
 
+    let _ = cell.pairs_per_second();
     say.step("on line: servoing");
     let bar = say.bar();
     // A hold ends in armed, and only an operator would go on from there.

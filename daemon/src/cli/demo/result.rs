@@ -26,6 +26,8 @@ pub(super) struct DemoResult {
     pub beats: (u64, u64),
     /// Pairs tracked.
     pub frames: u64,
+    /// Pairs a second that the scene published while the arm was servoed.
+    pub pairs_per_s: Option<f64>,
     /// Set-points on the wire that broke a limit, by the mock controller; `None` when it could not say.
     pub limit_violations: Option<u64>,
     /// Wake-up, computing, frame to command, round trip.
@@ -56,6 +58,7 @@ pub(super) fn collect(args: &DemoArgs, cell: &mut Cell, outcome: &Outcome) -> Re
         convergence_s: outcome.seconds.filter(|_| s.state == CONVERGED),
         beats: (s.ticks, s.overruns),
         frames: s.frames,
+        pairs_per_s: cell.pairs_per_second(),
         limit_violations: None,
         timing: [s.wakeup_us, s.compute_us, s.frame_to_command_us, s.round_trip_us],
         residual_px: s.residual_px,
@@ -101,6 +104,7 @@ impl DemoResult {
             "ticks": self.beats.0,
             "overruns": self.beats.1,
             "frames": self.frames,
+            "pairs_per_s": self.pairs_per_s,
             "limit_violations": self.limit_violations,
             "residual_px": if self.residual_px.is_finite() { Some(self.residual_px) } else { None },
             "state": self.state,
@@ -133,8 +137,11 @@ impl DemoResult {
         );
         let _ = writeln!(
             out,
-            "on the wire  {violations} limit violations; {} beats, {} overruns, {} stereo pairs",
-            self.beats.0, self.beats.1, self.frames
+            "on the wire  {violations} limit violations; {} beats, {} overruns, {} stereo pairs ({:.1} a second)",
+            self.beats.0,
+            self.beats.1,
+            self.frames,
+            self.pairs_per_s.unwrap_or(f64::NAN)
         );
         let _ = writeln!(out, "\nus                    p50       p99     p99.9       max");
         for (name, p) in ["wake-up", "compute", "frame to command", "round trip"].iter().zip(&self.timing) {

@@ -152,7 +152,7 @@ impl Arm {
             let at_ns = now_ns();
             while let Some(package) = framer.next().map_err(|e| e.to_string())? {
                 if let Event::Data(values) = session.handle(package).map_err(|e| e.to_string())? {
-                    let taken = clock.read(values).map_or(at_ns, |stamp| times.to_host(stamp, at_ns));
+                    let taken = clock.read(values).map_or(at_ns, |stamp| times.on_host(stamp, at_ns));
                     self.take(joints, bits, values, taken);
                 }
             }
@@ -182,7 +182,7 @@ impl ClockMap {
     const RESTART_NS: f64 = 1e9;
 
     /// When a package with this stamp (s) was made, given when it was read.
-    fn to_host(&mut self, stamp_s: f64, read_ns: u64) -> u64 {
+    fn on_host(&mut self, stamp_s: f64, read_ns: u64) -> u64 {
         let found = read_ns as f64 - stamp_s * 1e9;
         let (offset, since) = self.offset.unwrap_or((found, read_ns));
         let grown = offset + Self::DRIFT * read_ns.saturating_sub(since) as f64;
@@ -207,13 +207,13 @@ mod tests {
             let made = 5_000_000_000 + 2_000_000 * k;
             // Up to 30 ms late now and then, as a batch.
             let late = if k % 50 < 15 { 2_000_000 * (15 - k % 50) } else { 50_000 };
-            let at = clock.to_host(100.0 + 0.002 * k as f64, made + late);
+            let at = clock.on_host(100.0 + 0.002 * k as f64, made + late);
             if k > 60 {
                 assert!(at.abs_diff(made + 50_000) < 20_000, "{k}: {at} for {made}");
             }
         }
         // A controller that was restarted counts from zero.
-        assert_eq!(clock.to_host(0.0, 60_000_000_000), 60_000_000_000);
+        assert_eq!(clock.on_host(0.0, 60_000_000_000), 60_000_000_000);
     }
 
     #[test]
