@@ -1,10 +1,11 @@
 //! The link manager: makes the robot link on an ordinary thread, hands it to the command thread, takes dead ones back. It never arms.
 
 use crate::arm::{
-    ArmError, ArmLink, MockArm, MockLimits, Motion, UrConfig, UrLink, backoff_delay, fresh_token, recover,
+    ArmError, ArmLink, Ear, MockArm, MockLimits, Motion, RecoverTimes, UrConfig, UrLink, backoff_delay, walk_out,
 };
 use crate::config::{Config, LinkKind};
 use crate::threads::{Report, Shared};
+use std::cell::RefCell;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -26,6 +27,23 @@ pub fn ur_config(config: &Config) -> UrConfig {
     }
 }
 
+/// How long things may take.
+#[derive(Clone, Copy, Debug)]
+pub struct Pace {
+    /// Connecting, and each answer.
+    pub timeout: Duration,
+    /// Pause before attempt n, from 0.
+    pub backoff: fn(u32) -> Duration,
+    /// Powering up and unlocking.
+    pub recover: RecoverTimes,
+}
+
+impl Default for Pace {
+    fn default() -> Self {
+        Self { timeout: Duration::from_secs(5), backoff: backoff_delay, recover: RecoverTimes::default() }
+    }
+}
+
 /// Makes links and takes them back.
 #[derive(Debug)]
 pub struct LinkManager<'a> {
@@ -33,12 +51,31 @@ pub struct LinkManager<'a> {
     shared: &'a Shared,
     report: &'a Report,
     recover: &'a AtomicBool,
+    pace: Pace,
+    /// Hears why the controller stopped; `None` for the arm inside the daemon.
+    ear: RefCell<Option<Ear>>,
 }
 
 impl<'a> LinkManager<'a> {
     /// A manager that has made nothing yet.
     pub fn new(config: &'a Config, shared: &'a Shared, report: &'a Report, recover: &'a AtomicBool) -> Self {
-        Self { config, shared, report, recover }
+        Self::with_pace(config, shared, report, recover, Pace::default())
+    }
+
+    /// The same at another pace.
+    pub fn with_pace(
+        config: &'a Config,
+        shared: &'a Shared,
+        report: &'a Report,
+        recover: &'a AtomicBool,
+        pace: Pace,
+    ) -> Self {
+        let ear = (config.link == LinkKind::Rtde).then(|| Ear::new(&ur_config(config)));
+        Self { config, shared, report, recover, pace, ear: RefCell::new(ear) }
+    }
+
+    fn ur_config(&self) -> UrConfig {
+        UrConfig { timeout: self.pace.timeout, ..ur_config(self.config) }
     }
 
     /// Runs until shutdown.
@@ -53,7 +90,7 @@ impl<'a> LinkManager<'a> {
                     self.watch();
                 }
                 Err(e) => {
-                    let delay = backoff_delay(attempt);
+                    let delay = (self.pace.backoff)(attempt);
                     attempt += 1;
                     self.report.link(&format!("down: {e}"));
                     self.pause(delay);
@@ -70,8 +107,11 @@ impl<'a> LinkManager<'a> {
             }
             LinkKind::Rtde => {
                 self.report.link("connecting");
-                let config = ur_config(self.config);
+                let config = self.ur_config();
                 let mut link = UrLink::connect(&config)?;
+                if let Some(state) = link.state() {
+                    self.report.controller(state.robot_mode, state.safety_status_bits);
+                }
                 link.bring_up(&config)?;
                 Ok(Box::new(link))
             }
@@ -83,8 +123,9 @@ impl<'a> LinkManager<'a> {
         while !self.shared.ending() {
             if let Some(dead) = self.shared.link_dead.take() {
                 let s = dead.stats();
+                let why = dead.fault().map_or_else(String::new, |f| format!(": {f}"));
                 self.report.link(&format!(
-                    "lost after {} states and {} commands ({} states missed)",
+                    "lost after {} states and {} commands ({} states missed){why}",
                     s.received, s.sent, s.missing
                 ));
                 return;
@@ -94,23 +135,32 @@ impl<'a> LinkManager<'a> {
                 // A new session follows in any case: the old one's script is gone.
                 self.shared.drop_link.store(true, Ordering::Release);
             }
+            self.listen();
             std::thread::sleep(Duration::from_millis(10));
         }
     }
 
+    /// Takes what the controller has said.
+    fn listen(&self) {
+        if let Some(ear) = self.ear.borrow_mut().as_mut() {
+            for said in ear.listen() {
+                self.report.said(&said);
+            }
+        }
+    }
+
+    /// Walks the controller to a running arm. The script comes with the next session, which begins idle.
     fn recover_now(&self) {
         if self.config.link != LinkKind::Rtde {
+            self.report.recovered(Ok(()));
             return;
         }
-        let config = ur_config(self.config);
-        self.report.link("recovering");
-        let result = recover(&config, fresh_token(), 1.0 / 500.0, |step| {
-            eprintln!("graspd: recover: {} -> {}", step.command, step.answer);
+        self.report.recovering();
+        let result = walk_out(&self.ur_config(), self.pace.recover, &mut |step| {
+            self.report.recover_step(&format!("{}: {}", step.command, step.answer));
+            self.listen();
         });
-        match result {
-            Ok(()) => self.report.link("recovered; connecting"),
-            Err(e) => self.report.link(&format!("not recovered: {e}")),
-        }
+        self.report.recovered(result.map(drop).map_err(|e| e.to_string()));
     }
 
     /// Waits, but not longer than it takes for an operator to ask for a recovery.
@@ -121,6 +171,7 @@ impl<'a> LinkManager<'a> {
                 self.recover_now();
                 return;
             }
+            self.listen();
             std::thread::sleep(Duration::from_millis(10));
         }
     }

@@ -62,8 +62,14 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
                 enter("command", &command_settings, &mut heard);
                 let _ = said.send(heard);
                 let Ok(cycle) = cycle_out.recv() else { return };
-                shared_ref
-                    .guarded("command", || CommandWorker::new(cycle, shared_ref).run(config.period_ns(), spin_ns));
+                shared_ref.guarded("command", || {
+                    let mut worker = CommandWorker::new(cycle, shared_ref);
+                    if config.raw.beat.beat == "robot" {
+                        worker.run_with_robot(config.period_ns());
+                    } else {
+                        worker.run(config.period_ns(), spin_ns);
+                    }
+                });
             })
             .and_then(|_| {
                 spawn("vision").spawn_scoped(scope, move || {

@@ -40,7 +40,9 @@ impl Mock {
         let stop = Arc::new(AtomicBool::new(false));
         let stopped = Arc::clone(&stop);
         let thread = Some(std::thread::spawn(move || server.run(&stopped)));
-        Mock { config: UrConfig::new(address.to_string(), Model::Ur5e), stop, thread }
+        // A stalled host must not look like a dead client; the usual patience has a test of its own.
+        let config = UrConfig { watchdog_ms: 500.0, ..UrConfig::new(address.to_string(), Model::Ur5e) };
+        Mock { config, stop, thread }
     }
 }
 
@@ -151,7 +153,7 @@ fn recovery_walks_from_a_protective_stop_to_an_idle_script() {
     let refused = link.bring_up(&mock.config).unwrap_err();
     assert!(refused.to_string().contains("graspd recover"), "{refused}");
     let mut told = Vec::new();
-    recover(&mock.config, link.token(), link.step_s(), |step| told.push(step.command)).unwrap();
+    recover(&mock.config, link.token(), |step| told.push(step.command)).unwrap();
     assert!(told.contains(&"unlock protective stop") && told.last() == Some(&"upload"), "{told:?}");
     let token = link.token();
     let state = listen(&mut link, |s| s.script_token == token);
@@ -163,9 +165,9 @@ fn recovery_walks_from_a_protective_stop_to_an_idle_script() {
 #[test]
 fn recovery_powers_up_but_never_touches_an_emergency_stop() {
     let mock = Mock::start(Some(Command::PowerOff));
-    recover(&mock.config, 5, 0.002, |_| {}).unwrap();
+    recover(&mock.config, 5, |_| {}).unwrap();
     drop(mock);
     let mock = Mock::start(Some(Command::EmergencyStop { system: false }));
-    let error = recover(&mock.config, 5, 0.002, |_| {}).unwrap_err();
+    let error = recover(&mock.config, 5, |_| {}).unwrap_err();
     assert!(error.to_string().to_uppercase().contains("EMERGENCY"), "{error}");
 }

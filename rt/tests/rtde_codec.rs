@@ -179,7 +179,7 @@ fn meet(server: &mut Server, piece: usize) -> Result<Session, ClientError> {
 
 #[test]
 fn client_and_server_meet_in_both_versions_and_any_pieces() {
-    for (speaks, version, rate) in [(2, Version::V2, 500.0), (1, Version::V1, 125.0)] {
+    for (speaks, version, rate) in [(2, Version::V2, 500.0), (1, Version::V1, 500.0)] {
         for piece in [1, 2, 7, 4096] {
             let mut server = Server::new(speaks);
             let mut session = meet(&mut server, piece).unwrap();

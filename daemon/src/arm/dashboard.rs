@@ -28,23 +28,35 @@ impl Dashboard {
     /// Sends a command and gives its answer without the line's end.
     pub fn ask(&mut self, command: &str) -> Result<String, ArmError> {
         let line = format!("{command}\n");
-        self.stream.get_mut().write_all(line.as_bytes()).map_err(io)?;
+        self.stream.get_mut().write_all(line.as_bytes()).map_err(|e| io(e, self.timeout))?;
         self.line()
     }
 
     /// Sends a command whose answer must start with one of these words, in any case.
-    pub fn demand(&mut self, command: &str, success: &[&str]) -> Result<String, ArmError> {
+    ///
+    /// # Errors
+    /// Anything else, with `fix`.
+    pub fn demand(&mut self, command: &str, success: &[&str], fix: &'static str) -> Result<String, ArmError> {
         let answer = self.ask(command)?;
         let lower = answer.to_ascii_lowercase();
         if success.iter().any(|s| lower.starts_with(&s.to_ascii_lowercase())) {
             Ok(answer)
         } else {
-            Err(ArmError::Dashboard { command: command.to_owned(), answer })
+            Err(ArmError::Dashboard { command: command.to_owned(), answer, fix })
         }
     }
 
     /// Asks again and again until the answer contains `wanted`.
-    pub fn wait_for(&mut self, command: &'static str, wanted: &str, limit: Duration) -> Result<String, ArmError> {
+    ///
+    /// # Errors
+    /// The last answer with `fix` when it is not there in time.
+    pub fn wait_for(
+        &mut self,
+        command: &'static str,
+        wanted: &str,
+        limit: Duration,
+        fix: &'static str,
+    ) -> Result<String, ArmError> {
         let start = Instant::now();
         loop {
             let answer = self.ask(command)?;
@@ -52,7 +64,7 @@ impl Dashboard {
                 return Ok(answer);
             }
             if start.elapsed() >= limit {
-                return Err(ArmError::Dashboard { command: command.to_owned(), answer });
+                return Err(ArmError::Dashboard { command: command.to_owned(), answer, fix });
             }
             std::thread::sleep(Duration::from_millis(100));
         }
@@ -67,23 +79,24 @@ impl Dashboard {
             if left.is_zero() || line.len() as u64 >= MAX_LINE {
                 return Err(ArmError::Timeout { what: "dashboard answer", seconds: self.timeout.as_secs_f64() });
             }
-            self.stream.get_ref().set_read_timeout(Some(left)).map_err(io)?;
+            let fail = |e| io(e, self.timeout);
+            self.stream.get_ref().set_read_timeout(Some(left)).map_err(fail)?;
             // `fill_buf` reads once; `read_until` alone would go on as long as bytes drip in.
-            let available = self.stream.fill_buf().map_err(io)?;
+            let available = self.stream.fill_buf().map_err(fail)?;
             if available.is_empty() {
-                return Err(io(std::io::ErrorKind::UnexpectedEof.into()));
+                return Err(fail(std::io::ErrorKind::UnexpectedEof.into()));
             }
             let n = available.len() as u64;
-            self.stream.by_ref().take(n).read_until(b'\n', &mut line).map_err(io)?;
+            self.stream.by_ref().take(n).read_until(b'\n', &mut line).map_err(fail)?;
         }
         Ok(String::from_utf8_lossy(&line).trim_end().to_owned())
     }
 }
 
-fn io(source: std::io::Error) -> ArmError {
+fn io(source: std::io::Error, timeout: Duration) -> ArmError {
     match source.kind() {
         std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut => {
-            ArmError::Timeout { what: "dashboard answer", seconds: 0.0 }
+            ArmError::Timeout { what: "dashboard answer", seconds: timeout.as_secs_f64() }
         }
         _ => ArmError::Io { service: Port::Dashboard, source },
     }

@@ -87,6 +87,9 @@ pub trait ArmLink: Send {
     /// Counters.
     fn stats(&self) -> LinkStats;
 
+    /// Why it has ended, if it has.
+    fn fault(&self) -> Option<LinkFault>;
+
     /// Waits for the robot's next package, at most until `deadline_ns`; true when something came. With this the robot is the
     /// clock: wait for its package, compute, write, and the write lands in its next step. The one call that sleeps.
     fn wait(&mut self, deadline_ns: u64) -> bool;

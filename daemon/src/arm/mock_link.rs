@@ -221,6 +221,10 @@ impl ArmLink for MockArm {
         self.stats
     }
 
+    fn fault(&self) -> Option<LinkFault> {
+        self.cut
+    }
+
     /// Nothing to wait for: the next package is made by the next poll.
     fn wait(&mut self, _deadline_ns: u64) -> bool {
         false

@@ -54,7 +54,7 @@ impl<'a> Iterator for SubPackages<'a> {
 }
 
 /// Type and whole size of what starts here; `None` when there are too few bytes or the size is impossible.
-fn header(bytes: &[u8]) -> Option<(u8, usize)> {
+pub(super) fn header(bytes: &[u8]) -> Option<(u8, usize)> {
     let &[a, b, c, d, kind] = bytes.first_chunk::<5>()?;
     let size = usize::try_from(i32::from_be_bytes([a, b, c, d])).ok()?;
     if (5..=MAX_PACKAGE).contains(&size) { Some((kind, size)) } else { None }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use graspd_rt::arm::{ArmCommand, ArmMode, Joints, RobotState};
 use graspd_rt::rtde::{
     COMMAND_FIELDS, ClockStep, CommandWriter, ControllerVersion, Event, Framer, GapMeter, MAX_PACKAGE, Phase,
-    SCRIPT_VERSION, STATE_FIELDS, Session, StateReader, script_state,
+    SCRIPT_VERSION, STATE_FIELDS, Session, StateReader, Version, script_state,
 };
 
 use super::link::{ArmLink, LinkFault, LinkPoll, LinkStats};
@@ -45,6 +45,8 @@ pub struct UrLink {
     blocked_since_ns: Option<u64>,
     /// Joint targets of position mode, and when they were last moved on.
     targets: Option<(Joints, u64)>,
+    /// Longest time that one beat may move them on, ns.
+    most_ns: u64,
     motion: Motion,
     last: Option<RobotState>,
     now_ns: u64,
@@ -78,6 +80,7 @@ impl UrLink {
             unsent_to: 0,
             blocked_since_ns: None,
             targets: None,
+            most_ns: (2e9 / config.beat_hz.max(1.0)).max(10e6) as u64,
             motion: config.motion,
             last: None,
             now_ns: 0,
@@ -197,6 +200,11 @@ impl UrLink {
         self.session.controller()
     }
 
+    /// Protocol version of the session.
+    pub fn version(&self) -> Version {
+        self.session.version()
+    }
+
     /// The controller's step, s.
     pub fn step_s(&self) -> f64 {
         self.controller().map_or(0.002, |v| 1.0 / v.max_frequency_hz())
@@ -285,8 +293,8 @@ impl UrLink {
         }
         let start = self.last.map(|s| s.target_q)?;
         let (mut q, then) = self.targets.unwrap_or((start, self.now_ns));
-        // A late beat moves the target on by 10 ms at most: the arm waits for us, it does not leap.
-        let dt = self.now_ns.saturating_sub(then).min(10_000_000) as f64 * 1e-9;
+        // A late beat moves the target on by two beats at most: the arm waits for us, it does not leap.
+        let dt = self.now_ns.saturating_sub(then).min(self.most_ns) as f64 * 1e-9;
         for (q, rate) in q.iter_mut().zip(command.rates) {
             *q += rate * dt;
         }
@@ -357,6 +365,10 @@ impl ArmLink for UrLink {
 
     fn stats(&self) -> LinkStats {
         self.stats
+    }
+
+    fn fault(&self) -> Option<LinkFault> {
+        self.fault
     }
 
     fn wait(&mut self, deadline_ns: u64) -> bool {

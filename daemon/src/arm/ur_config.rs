@@ -177,12 +177,14 @@ pub enum ArmError {
         found: String,
     },
     /// A dashboard command was refused.
-    #[error("dashboard refused `{command}`: {answer}")]
+    #[error("dashboard answers `{command}` with \"{answer}\": {fix}")]
     Dashboard {
         /// What was asked.
         command: String,
         /// What was answered.
         answer: String,
+        /// What to do.
+        fix: &'static str,
     },
     /// A setting cannot be.
     #[error("{key} = {value}: {fix}")]

@@ -37,6 +37,8 @@ pub enum Command {
     Reset(ClientArgs),
     /// Walk the controller out of a protective stop (close popup, unlock, power, brakes, script); ends idle
     Recover(ClientArgs),
+    /// Close or open the gripper by its outputs; at rest or on the grasp only
+    Gripper(GripperArgs),
     /// Offer a plan to the daemon as its set-point
     Setpoint(SetpointArgs),
     /// Reconstruct circles and ellipses from edge points in two views (JSON in, JSON out)
@@ -89,6 +91,17 @@ pub struct ClientArgs {
     /// How long to wait for the daemon, seconds
     #[arg(long, default_value_t = 2.0)]
     pub timeout: f64,
+}
+
+/// `graspd gripper`.
+#[derive(Debug, Args)]
+pub struct GripperArgs {
+    /// Which way
+    #[arg(value_parser = ["close", "open"])]
+    pub way: String,
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub client: ClientArgs,
 }
 
 /// `graspd setpoint`.

@@ -4,9 +4,10 @@ use super::args::{ClientArgs, SetpointArgs};
 use crate::config::Config;
 use crate::exit::{Exit, Failure};
 use crate::realtime::now_ns;
-use graspd_shm::control::{RequestClient, Verb};
+use graspd_shm::control::{Answer, RequestClient, Verb};
 use graspd_shm::{Names, create_node};
-use std::time::Duration;
+use serde_json::Value;
+use std::time::{Duration, Instant};
 
 /// Where the daemon of these arguments is to be found.
 fn names(args: &ClientArgs) -> Result<Names, Failure> {
@@ -16,11 +17,8 @@ fn names(args: &ClientArgs) -> Result<Names, Failure> {
     }
 }
 
-/// Sends a verb, prints the answer.
-///
-/// # Errors
-/// No daemon, a refused request, or a file that cannot be read.
-pub fn send(args: &ClientArgs, verb: Verb, payload: &[u8]) -> Result<Exit, Failure> {
+/// A way to the daemon.
+fn connect(args: &ClientArgs) -> Result<RequestClient, Failure> {
     if !(args.timeout.is_finite() && args.timeout > 0.0 && args.timeout <= 3600.0) {
         return Err(Failure {
             exit: Exit::Usage,
@@ -28,15 +26,94 @@ pub fn send(args: &ClientArgs, verb: Verb, payload: &[u8]) -> Result<Exit, Failu
         });
     }
     let node = create_node(&names(args)?, "graspd-client").map_err(|e| Failure::link(e.to_string()))?;
-    let client = RequestClient::new(&node).map_err(|e| Failure::link(e.to_string()))?;
-    let answer = client
-        .ask(verb, payload, now_ns(), Duration::from_secs_f64(args.timeout))
-        .map_err(|e| Failure::link(e.to_string()))?;
+    RequestClient::new(&node).map_err(|e| Failure::link(e.to_string()))
+}
+
+fn ask(client: &RequestClient, args: &ClientArgs, verb: Verb, payload: &[u8]) -> Result<Answer, Failure> {
+    client.ask(verb, payload, now_ns(), Duration::from_secs_f64(args.timeout)).map_err(|e| Failure::link(e.to_string()))
+}
+
+/// Sends a verb, prints the answer.
+///
+/// # Errors
+/// No daemon, a refused request, or a file that cannot be read.
+pub fn send(args: &ClientArgs, verb: Verb, payload: &[u8]) -> Result<Exit, Failure> {
+    let answer = ask(&connect(args)?, args, verb, payload)?;
+    show(args, &answer);
+    verdict(&answer)
+}
+
+fn show(args: &ClientArgs, answer: &Answer) {
     if args.json {
         println!("{}", answer.json);
     } else {
         print_words(&answer.json);
     }
+}
+
+/// How long a recovery may take: power, brakes, unlocking, and a new session.
+const RECOVERY: Duration = Duration::from_secs(90);
+
+/// `graspd recover`: asks for it, tells each step, and ends when the arm is idle under a new session, or with what stands in the way.
+///
+/// # Errors
+/// As [`send`], and what the controller refuses.
+pub fn recover(args: &ClientArgs) -> Result<Exit, Failure> {
+    let client = connect(args)?;
+    let status = || -> Result<(Answer, Value), Failure> {
+        let answer = ask(&client, args, Verb::Status, b"")?;
+        let value = serde_json::from_str(&answer.json).unwrap_or(Value::Null);
+        Ok((answer, value))
+    };
+    let number = |v: &Value| v.pointer("/recovery/number").and_then(Value::as_u64).unwrap_or(0);
+    let before = number(&status()?.1);
+    let answer = ask(&client, args, Verb::Recover, b"")?;
+    if !answer.accepted {
+        show(args, &answer);
+        return verdict(&answer);
+    }
+    let (start, mut told) = (Instant::now(), 0);
+    loop {
+        std::thread::sleep(Duration::from_millis(100));
+        let (answer, v) = status()?;
+        let steps = v.pointer("/recovery/steps").and_then(Value::as_array).cloned().unwrap_or_default();
+        let begun = number(&v) > before;
+        let running = v.pointer("/recovery/running").and_then(Value::as_bool).unwrap_or(false);
+        if begun && !args.json {
+            steps.iter().skip(told).filter_map(Value::as_str).for_each(|s| println!("{s}"));
+            told = steps.len();
+        }
+        let robot = v.get("robot").and_then(Value::as_str).unwrap_or_default();
+        let error = v.pointer("/recovery/error").and_then(Value::as_str).map(str::to_owned);
+        // The first attempt at a session may come too early for the controller; a reason that stays is one.
+        let stays = start.elapsed() > Duration::from_secs(15);
+        let error = error.or_else(|| robot.strip_prefix("down: ").filter(|_| stays).map(str::to_owned));
+        let ended = begun && !running && (error.is_some() || robot == "up");
+        if ended || start.elapsed() > RECOVERY {
+            if args.json {
+                println!("{}", answer.json);
+            }
+            return match error {
+                Some(e) => Err(Failure::link(format!("not recovered: {e}"))),
+                None if !ended => Err(Failure::link(format!(
+                    "not recovered within {} s; the robot link is: {robot}",
+                    RECOVERY.as_secs()
+                ))),
+                None => {
+                    if !args.json {
+                        let fault = v.get("state").and_then(Value::as_str) == Some("fault");
+                        let next = if fault { "; `graspd reset` clears the fault" } else { "" };
+                        println!("the robot runs and the arm is idle{next}");
+                    }
+                    Ok(Exit::Done)
+                }
+            };
+        }
+    }
+}
+
+/// The exit code of an answer.
+fn verdict(answer: &Answer) -> Result<Exit, Failure> {
     if answer.accepted {
         return Ok(Exit::Done);
     }

@@ -12,9 +12,10 @@ mod study;
 mod world;
 
 pub use args::{
-    Cli, ClientArgs, Command, DemoArgs, PassThrough, PlanArgs, ReconstructArgs, RunArgs, SetpointArgs, StudyArgs,
+    Cli, ClientArgs, Command, DemoArgs, GripperArgs, PassThrough, PlanArgs, ReconstructArgs, RunArgs, SetpointArgs,
+    StudyArgs,
 };
-pub use client::{send, setpoint};
+pub use client::{recover, send, setpoint};
 pub use mesh::MeshArgs;
 pub use plan::plan;
 pub use reconstruct::reconstruct;

@@ -3,7 +3,7 @@
 use super::settings::Config;
 use crate::exit::Failure;
 use graspd_rt::arm::{Dh, Model};
-use graspd_rt::cycle::{ConvergeSettings, CycleConfig, CycleSettings, WatchSettings};
+use graspd_rt::cycle::{ConvergeSettings, CycleConfig, CycleSettings, TaskSettings, WatchSettings};
 use graspd_rt::guard::LimitSettings;
 use graspd_rt::online::path::PathSettings;
 use graspd_rt::online::screw::{JacobianAt, LawSettings, ViewMode};
@@ -42,6 +42,10 @@ pub fn cycle_config(c: &Config, dh: Dh, realtime: bool) -> CycleConfig {
     // the arm (the robot's own watchdog stands behind that).
     let strict = realtime && !raw.beat.best_effort;
     let mut watch = if strict { WatchSettings::default() } else { WatchSettings::best_effort() };
+    // One package that a slow controller leaves out must not be a stale state.
+    if !c.model.is_e_series() {
+        watch.state_age_ns = watch.state_age_ns.max(28_000_000);
+    }
     watch.skew_ns = (raw.vision.max_skew_ms * 1e6) as u64;
     CycleConfig {
         model: c.model,
@@ -66,9 +70,22 @@ pub fn cycle_config(c: &Config, dh: Dh, realtime: bool) -> CycleConfig {
                 ..ConvergeSettings::default()
             },
             watch,
+            task: TaskSettings {
+                close_outputs: outputs_word(&raw.gripper.close_set, &raw.gripper.close_clear),
+                open_outputs: outputs_word(&raw.gripper.open_set, &raw.gripper.open_clear),
+                grip_ns: (raw.gripper.time_ms * 1e6) as u64,
+                close_on_arrival: raw.gripper.close_on_arrival,
+                ..TaskSettings::default()
+            },
             ..CycleSettings::default()
         },
     }
+}
+
+/// The outputs word of the control script: mask in the upper 16 bits, values in the lower.
+fn outputs_word(set: &[u8], clear: &[u8]) -> u32 {
+    let bits = |list: &[u8]| list.iter().fold(0u32, |word, o| word | 1 << (o & 15));
+    (bits(set) | bits(clear)) << 16 | bits(set)
 }
 
 #[derive(serde::Deserialize)]

@@ -5,5 +5,5 @@ mod raw;
 mod settings;
 
 pub use cycle::{cycle_config, load_kinematics};
-pub use raw::{RawArm, RawConfig, RawConverged, RawFiles, RawLimits, RawLoop, RawServo, RawShm, RawVision};
+pub use raw::{RawArm, RawConfig, RawConverged, RawFiles, RawGripper, RawLimits, RawLoop, RawServo, RawShm, RawVision};
 pub use settings::{Config, Kinematics, LinkKind, names};

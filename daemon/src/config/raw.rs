@@ -32,6 +32,9 @@ pub struct RawConfig {
     /// Limits of the motion, below the arm's own.
     #[serde(default)]
     pub limits: RawLimits,
+    /// The outputs that move the gripper's fingers.
+    #[serde(default)]
+    pub gripper: RawGripper,
 }
 
 /// `[files]`: paths, relative to the folder of graspd.toml.
@@ -82,8 +85,10 @@ pub struct RawArm {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RawLoop {
-    /// Beat of the command thread, Hz; 50 to 1000. 500 suits e-Series, 125 CB3.
+    /// Beat of the command thread, Hz; 50 to 1000, or 0 for the controller's own: 500, CB3 125.
     pub rate_hz: f64,
+    /// What the beat follows: "timer", or "robot" (phase-locked to the controller's packages).
+    pub beat: String,
     /// SCHED_FIFO priority of the command thread; 0 asks for none.
     pub command_priority: u8,
     /// SCHED_FIFO priority of the vision thread, below the command thread's.
@@ -104,7 +109,8 @@ pub struct RawLoop {
 impl Default for RawLoop {
     fn default() -> Self {
         Self {
-            rate_hz: 500.0,
+            rate_hz: 0.0,
+            beat: "timer".into(),
             command_priority: 80,
             vision_priority: 70,
             command_core: None,
@@ -211,6 +217,38 @@ impl Default for RawLimits {
             joint_jerk_rad_s3: 800.0,
             tcp_speed_m_s: 0.25,
             joint_margin_rad: 0.1,
+        }
+    }
+}
+
+/// `[gripper]`: outputs by number, 0 to 7 the controller's digital outputs, 8 and 9 the tool's.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RawGripper {
+    /// Outputs switched on to close the fingers.
+    pub close_set: Vec<u8>,
+    /// Outputs switched off to close them.
+    pub close_clear: Vec<u8>,
+    /// Outputs switched on to open them.
+    pub open_set: Vec<u8>,
+    /// Outputs switched off to open them.
+    pub open_clear: Vec<u8>,
+    /// How long the fingers take, ms.
+    pub time_ms: f64,
+    /// Close by itself when the grasp is reached; otherwise only when asked (`graspd gripper close`).
+    pub close_on_arrival: bool,
+}
+
+impl Default for RawGripper {
+    fn default() -> Self {
+        let none = Vec::new;
+        Self {
+            close_set: none(),
+            close_clear: none(),
+            open_set: none(),
+            open_clear: none(),
+            time_ms: 800.0,
+            close_on_arrival: false,
         }
     }
 }

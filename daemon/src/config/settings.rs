@@ -68,9 +68,28 @@ impl Config {
         let text = std::fs::read_to_string(path).map_err(|e| {
             Failure::input(format!("{shown}: cannot be read ({e}); docs/CONFIG.md has an example to start from"))
         })?;
-        let raw: RawConfig = toml::from_str(&text)
+        let mut raw: RawConfig = toml::from_str(&text)
             .map_err(|e| Failure::input(format!("{shown}: {e}\nSee docs/CONFIG.md for every key.")))?;
+        let model = Model::from_name(&raw.arm.model).ok_or_else(|| {
+            bad(path, "arm.model", &raw.arm.model, "use ur3, ur5, ur10, ur3e, ur5e, ur10e, ur16e, ur20 or ur30")
+        })?;
+        if raw.beat.rate_hz == 0.0 {
+            raw.beat.rate_hz = controller_hz(model);
+        }
         check_numbers(path, &raw)?;
+        check_outputs(path, &raw)?;
+        one_of(path, "loop.beat", &raw.beat.beat, &["timer", "robot"])?;
+        if raw.beat.beat == "robot" && raw.beat.rate_hz != controller_hz(model) {
+            return Err(bad(
+                path,
+                "loop.rate_hz",
+                &raw.beat.rate_hz.to_string(),
+                &format!(
+                    "loop.beat = \"robot\" beats as the controller does: leave loop.rate_hz out, or set {}",
+                    controller_hz(model)
+                ),
+            ));
+        }
         let folder = path.parent().unwrap_or(Path::new("."));
         let names = names(&raw.cell, raw.shm.root.as_deref().map(|r| folder.join(r)).as_deref())
             .map_err(|e| Failure::input(format!("{shown}: {e}")))?;
@@ -81,9 +100,6 @@ impl Config {
             "mock" => LinkKind::Mock,
             other => return Err(bad(path, "arm.link", other, "use \"rtde\" or \"mock\"")),
         };
-        let model = Model::from_name(&raw.arm.model).ok_or_else(|| {
-            bad(path, "arm.model", &raw.arm.model, "use ur3, ur5, ur10, ur3e, ur5e, ur10e, ur16e, ur20 or ur30")
-        })?;
         let kinematics = match raw.arm.kinematics.as_str() {
             "controller" => Kinematics::Controller,
             "nominal" => Kinematics::Nominal,
@@ -102,6 +118,11 @@ impl Config {
     }
 }
 
+/// Steps a second of the controller that an arm of this model comes with.
+fn controller_hz(model: Model) -> f64 {
+    if model.is_e_series() { 500.0 } else { 125.0 }
+}
+
 fn bad(path: &Path, key: &str, value: &str, fix: &str) -> Failure {
     Failure::input(format!("{}: {key} = \"{value}\": {fix}", path.display()))
 }
@@ -111,6 +132,28 @@ fn one_of(path: &Path, key: &str, value: &str, allowed: &[&str]) -> Result<(), F
         return Ok(());
     }
     Err(bad(path, key, value, &format!("use one of: {}", allowed.join(", "))))
+}
+
+/// Outputs that exist, each once.
+fn check_outputs(path: &Path, c: &RawConfig) -> Result<(), Failure> {
+    let g = &c.gripper;
+    let lists = [
+        ("gripper.close_set", &g.close_set, &g.close_clear),
+        ("gripper.close_clear", &g.close_clear, &g.close_set),
+        ("gripper.open_set", &g.open_set, &g.open_clear),
+        ("gripper.open_clear", &g.open_clear, &g.open_set),
+    ];
+    for (key, outputs, others) in lists {
+        if let Some(wrong) = outputs.iter().find(|o| **o > 9 || others.contains(o)) {
+            let fix = "use each output once: 0 to 7 are the controller's digital outputs, 8 and 9 the tool's";
+            return Err(bad(path, key, &wrong.to_string(), fix));
+        }
+    }
+    if g.close_on_arrival && g.close_set.is_empty() && g.close_clear.is_empty() {
+        let fix = "name the outputs that close the fingers in gripper.close_set or gripper.close_clear";
+        return Err(bad(path, "gripper.close_on_arrival", "true", fix));
+    }
+    Ok(())
 }
 
 /// Every number with its range: finite, and inside what the arm, the host or the law can do.
@@ -137,6 +180,7 @@ fn check_numbers(path: &Path, c: &RawConfig) -> Result<(), Failure> {
         ("limits.joint_accel_rad_s2", c.limits.joint_accel_rad_s2, 0.01, 40.0),
         ("limits.joint_jerk_rad_s3", c.limits.joint_jerk_rad_s3, 0.1, 10_000.0),
         ("limits.tcp_speed_m_s", c.limits.tcp_speed_m_s, 0.001, 1.0),
+        ("gripper.time_ms", c.gripper.time_ms, 0.0, 60_000.0),
         ("limits.joint_margin_rad", c.limits.joint_margin_rad, 0.0, 1.0),
     ];
     for (key, value, low, high) in ranges {

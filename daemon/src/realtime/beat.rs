@@ -46,14 +46,7 @@ impl Beat {
     /// Sleeps to the next deadline of the grid.
     pub fn wait(&mut self) -> Tick {
         let deadline = self.next_ns;
-        let until = deadline.saturating_sub(self.spin_ns);
-        let ts = Timespec {
-            tv_sec: i64::try_from(until / 1_000_000_000).unwrap_or(i64::MAX),
-            tv_nsec: i64::try_from(until % 1_000_000_000).unwrap_or(0),
-        };
-        // EINTR returns early; the deadline stands, so ask again. Any other error cannot happen for a valid time on this clock,
-        // and falling through then only makes this beat early, never the next one late.
-        while let Err(rustix::io::Errno::INTR) = clock_nanosleep_absolute(ClockId::Monotonic, &ts) {}
+        sleep_until(deadline.saturating_sub(self.spin_ns));
         while self.spin_ns > 0 && now_ns() < deadline {
             std::hint::spin_loop();
         }
@@ -62,6 +55,17 @@ impl Beat {
         self.next_ns = deadline + (skipped + 1) * self.period_ns;
         Tick { deadline_ns: deadline, woke_ns: woke, skipped }
     }
+}
+
+/// Sleeps to an instant of CLOCK_MONOTONIC, ns; returns at once when it has passed.
+pub fn sleep_until(until_ns: u64) {
+    let ts = Timespec {
+        tv_sec: i64::try_from(until_ns / 1_000_000_000).unwrap_or(i64::MAX),
+        tv_nsec: i64::try_from(until_ns % 1_000_000_000).unwrap_or(0),
+    };
+    // EINTR returns early; the deadline stands, so ask again. Any other error cannot happen for a valid time on this clock,
+    // and falling through then only makes this beat early, never the next one late.
+    while let Err(rustix::io::Errno::INTR) = clock_nanosleep_absolute(ClockId::Monotonic, &ts) {}
 }
 
 #[cfg(test)]

@@ -4,6 +4,6 @@ mod beat;
 mod setup;
 mod sys;
 
-pub use beat::{Beat, Tick, now_ns};
+pub use beat::{Beat, Tick, now_ns, sleep_until};
 pub use setup::{RealtimeReport, ThreadSettings, enter, lock_memory};
 pub use sys::thread_faults;

@@ -3,10 +3,11 @@
 use super::shared::{JointSample, Shared};
 use super::telemetry::BeatRecord;
 use crate::arm::{ArmLink, LinkPoll};
-use crate::realtime::{Beat, Tick, now_ns};
+use crate::realtime::{Beat, Tick, now_ns, sleep_until};
 use graspd_rt::arm::RobotState;
 use graspd_rt::cycle::{CommandCycle, CommandInput, LinkStatus};
 use graspd_rt::online::Vision;
+use graspd_rt::rtde::PhaseLock;
 use std::sync::atomic::Ordering;
 
 /// Commands whose sending time is kept, to measure the round trip by the echoed beat.
@@ -19,6 +20,8 @@ pub struct CommandWorker<'a> {
     link: Option<Box<dyn ArmLink>>,
     status: LinkStatus,
     robot: Option<RobotState>,
+    /// State packages that the last poll took.
+    packages: u32,
     /// The capture time of the newest pair that no command has answered yet.
     unanswered: Option<u64>,
     sent_ns: [(i32, u64); SENT],
@@ -40,6 +43,7 @@ impl<'a> CommandWorker<'a> {
             link: None,
             status: LinkStatus::default(),
             robot: None,
+            packages: 0,
             unanswered: None,
             sent_ns: [(0, 0); SENT],
             echo: 0,
@@ -53,6 +57,29 @@ impl<'a> CommandWorker<'a> {
             let tick = beat.wait();
             self.beat(&tick);
             self.shared.command_beat.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Runs until shutdown on the robot's beat: its package, then the command, which so lands in its next step. Without a robot, or
+    /// with one that is silent, a timer.
+    pub fn run_with_robot(&mut self, period_ns: u64) {
+        let mut lock = PhaseLock::new(period_ns, now_ns());
+        let mut skipped = 0;
+        while !self.shared.ending() {
+            let deadline_ns = lock.next_ns();
+            sleep_until(lock.listen_ns());
+            let come = match self.link.as_mut() {
+                Some(link) => link.wait(lock.give_up_ns()),
+                None => false,
+            };
+            if !come {
+                sleep_until(lock.give_up_ns());
+            }
+            sleep_until(lock.arrived(now_ns(), come));
+            self.beat(&Tick { deadline_ns, woke_ns: now_ns(), skipped });
+            self.shared.command_beat.fetch_add(1, Ordering::Relaxed);
+            let stamp = self.robot.filter(|_| self.packages == 1).map(|r| r.timestamp_s);
+            skipped = lock.advance(now_ns(), stamp);
         }
     }
 
@@ -123,9 +150,13 @@ impl<'a> CommandWorker<'a> {
     }
 
     fn poll(&mut self, now: u64) -> Option<RobotState> {
+        self.packages = 0;
         let link = self.link.as_mut()?;
         match link.poll(now) {
-            LinkPoll { fault: None, state, .. } => state,
+            LinkPoll { fault: None, state, packages, .. } => {
+                self.packages = packages;
+                state
+            }
             LinkPoll { .. } => {
                 self.drop_link();
                 None

@@ -46,7 +46,7 @@ impl Service<'_> {
                 self.shared.stop_latch.store(true, Ordering::Release);
                 Ok(())
             }
-            Verb::Arm | Verb::Servo | Verb::Setpoint if stale => {
+            Verb::Arm | Verb::Servo | Verb::Setpoint | Verb::Gripper if stale => {
                 Err("the request is older than 250 ms and is not carried out; send it again".to_owned())
             }
             Verb::Arm => self.ask(id, RequestKind::Arm),
@@ -54,6 +54,7 @@ impl Service<'_> {
             Verb::Reset => self.ask(id, RequestKind::Reset),
             Verb::Setpoint => self.setpoint(&request.payload),
             Verb::Recover => self.recover(),
+            Verb::Gripper => self.gripper(&request.payload, id),
         };
         if request.verb == Verb::Stop {
             self.wait_for_the_ramp();
@@ -114,6 +115,19 @@ impl Service<'_> {
             .set_point(text, "the plan", (&rig, &self.config.rig), (&gripper, &self.config.gripper))
             .map_err(|e| e.to_string())?;
         Ok((format!("{} at {:.3} m", plan.object.model, setpoint.object_centre.norm()), setpoint))
+    }
+
+    fn gripper(&self, payload: &[u8], id: u64) -> Result<(), String> {
+        let g = &self.config.raw.gripper;
+        let (close, outputs) = match payload {
+            b"close" => (true, [&g.close_set, &g.close_clear]),
+            b"open" => (false, [&g.open_set, &g.open_clear]),
+            _ => return Err("ask the gripper to `close` or to `open`".to_owned()),
+        };
+        if outputs.iter().all(|list| list.is_empty()) {
+            return Err("no outputs move the gripper that way: name them in [gripper] of the configuration".to_owned());
+        }
+        self.ask(id, RequestKind::Gripper { close })
     }
 
     fn recover(&self) -> Result<(), String> {

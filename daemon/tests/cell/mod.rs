@@ -48,6 +48,11 @@ impl Process {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
     }
+
+    /// SIGSTOP, SIGCONT.
+    pub(crate) fn signal(&self, signal: rustix::process::Signal) {
+        rustix::process::kill_process(rustix::process::Pid::from_child(&self.child), signal).unwrap();
+    }
 }
 
 impl Drop for Process {
@@ -57,15 +62,37 @@ impl Drop for Process {
     }
 }
 
+/// What makes a cell other than the usual one.
+#[derive(Clone, Debug)]
+pub(crate) struct Extra {
+    /// Stereo pairs a second.
+    pub(crate) frame_rate: f64,
+    /// Lines added to `[arm]`, with their ends.
+    pub(crate) arm: String,
+    /// Whether the mock writes its wire record to `wire`.
+    pub(crate) record: bool,
+}
+
+impl Default for Extra {
+    fn default() -> Self {
+        Self { frame_rate: 60.0, arm: String::new(), record: false }
+    }
+}
+
 /// A world, its plan and its daemon's configuration, in a folder of its own.
 pub(crate) struct World {
     pub(crate) folder: PathBuf,
     pub(crate) address: String,
     pub(crate) joints: String,
+    extra: Extra,
 }
 
 impl World {
     pub(crate) fn new(seed: u64) -> Self {
+        Self::with(seed, Extra::default())
+    }
+
+    pub(crate) fn with(seed: u64, extra: Extra) -> Self {
         let folder = std::env::temp_dir().join(format!("graspd-kill-{}-{seed}", std::process::id()));
         let _ = std::fs::remove_dir_all(&folder);
         let scenario = Scenario::from_seed(seed, &Options::default()).unwrap();
@@ -93,10 +120,12 @@ impl World {
         let joints = scenario.start.map(|q| format!("{q:.9}")).join(",");
         let config = format!(
             "cell = \"kill\"\n[files]\nrig = \"world/rig.toml\"\ngripper = \"world/gripper.toml\"\n[shm]\nroot = \"shm\"\n\
-             [arm]\nmodel = \"ur5e\"\naddress = \"{address}\"\nkinematics = \"world/arm.toml\"\n[loop]\nbest_effort = true\n"
+             [arm]\nmodel = \"ur5e\"\naddress = \"{address}\"\nkinematics = \"world/arm.toml\"\n{}[loop]\nbest_effort = true\n\
+             [vision]\nframe_rate_hz = {:.1}\n",
+            extra.arm, extra.frame_rate
         );
         std::fs::write(folder.join("graspd.toml"), config).unwrap();
-        Self { folder, address, joints }
+        Self { folder, address, joints, extra }
     }
 
     pub(crate) fn path(&self, name: &str) -> String {
@@ -107,14 +136,17 @@ impl World {
         let (address, kinematics) = (&self.address, self.path("world/true_arm.toml"));
         let args = ["mock-ur", "--bind", address, "--start-joints", &self.joints, "--kinematics", &kinematics];
         let more = ["--control-port", "0", "--limits", "0.5,4.0", "--exit-with-stdin"];
-        Process::start(&[&args[..], &more[..]].concat(), &self.folder.join("mock.log"))
+        let wire = self.path("wire");
+        let record: &[&str] = if self.extra.record { &["--record", &wire] } else { &[] };
+        Process::start(&[&args[..], &more[..], record].concat(), &self.folder.join("mock.log"))
     }
 
     pub(crate) fn scene(&self) -> Process {
         let (world, rtde, root) = (self.path("world"), format!("{}:30004", self.address), self.path("shm"));
-        let args =
-            ["scene", "--world", &world, "--rtde", &rtde, "--shm-root", &root, "--cell", "kill", "--control-port", "0"];
-        Process::start(&args, &self.folder.join("scene.log"))
+        let rate = format!("{:.1}", self.extra.frame_rate);
+        let args = ["scene", "--world", &world, "--rtde", &rtde, "--shm-root", &root, "--cell", "kill"];
+        let more = ["--control-port", "0", "--rate", &rate];
+        Process::start(&[&args[..], &more[..]].concat(), &self.folder.join("scene.log"))
     }
 
     pub(crate) fn daemon(&self) -> Process {
@@ -151,11 +183,32 @@ impl World {
         (text("state"), text("cause"))
     }
 
-    /// Plan in, armed, moving for `after`.
+    /// Plan in, armed, moving for `after`. A host that stalls may end the control script before the arm has moved; then, as an
+    /// operator would: recover, reset, and from the start.
     pub(crate) fn servo(&self, after: Duration) {
-        self.insist(&["setpoint", &self.path("plan.toml")]);
-        self.insist(&["arm"]);
-        self.insist(&["servo"]);
+        let plan = self.path("plan.toml");
+        let until = Instant::now() + Duration::from_secs(120);
+        'again: loop {
+            let begun = Instant::now();
+            for verb in [&["setpoint", &plan][..], &["arm"], &["servo"]] {
+                loop {
+                    let (accepted, said) = self.verb(verb);
+                    if accepted {
+                        break;
+                    }
+                    let log = || std::fs::read_to_string(self.folder.join("graspd.log")).unwrap_or_default();
+                    assert!(Instant::now() < until, "{verb:?} is refused: {said}\n{}", log());
+                    std::thread::sleep(Duration::from_millis(100));
+                    let fault = said.get("state").and_then(Value::as_str) == Some("fault");
+                    if fault || begun.elapsed() > Duration::from_secs(15) {
+                        self.verb(&["recover"]);
+                        self.verb(&["reset"]);
+                        continue 'again;
+                    }
+                }
+            }
+            break;
+        }
         std::thread::sleep(after);
     }
 

@@ -501,6 +501,11 @@ impl CommandCycle {
             self.fresh_leg(now);
         } else {
             self.apply(Event::Reached, Why::Progress, now, event);
+            let arrived = self.mode == Mode::Converged && stage == Stage::Grasp;
+            if arrived && self.config.settings.task.close_on_arrival && !self.work.closed() {
+                // The mode is the one in which this is never refused.
+                let _ = self.grip(true, now);
+            }
         }
     }
 
@@ -509,8 +514,9 @@ impl CommandCycle {
         let mode = match self.mode {
             Mode::Servoing | Mode::Converged => ArmMode::Velocity,
             Mode::Stopping(_) => ArmMode::Velocity,
-            Mode::Fault(_) => ArmMode::Stop,
-            Mode::Idle | Mode::Tracking | Mode::Armed => ArmMode::Idle,
+            // A fault is reached at rest, and is latched here. The control script must be able to leave its own: it ends one, and
+            // a fresh one begins, with idle alone; asked for anything else no reset would ever find the cause gone.
+            Mode::Idle | Mode::Tracking | Mode::Armed | Mode::Fault(_) => ArmMode::Idle,
         };
         let rates = if mode == ArmMode::Velocity { *self.guard.last() } else { [0.0; 6] };
         ArmCommand { mode, rates, beat: self.beat, outputs: self.outputs }

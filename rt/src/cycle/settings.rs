@@ -150,6 +150,8 @@ pub struct TaskSettings {
     pub open_outputs: u32,
     /// Time that closing or opening takes, ns. Default 800 ms.
     pub grip_ns: u64,
+    /// Close as soon as the gripper is on the grasp, without being asked. Default false.
+    pub close_on_arrival: bool,
     /// Greatest angle of one turn, rad. Default 1.6 (a quarter turn and a little).
     pub max_turn_rad: f64,
     /// Speed share of turning and of the retreat, 0 to 1. Default 0.5.
@@ -158,7 +160,14 @@ pub struct TaskSettings {
 
 impl Default for TaskSettings {
     fn default() -> Self {
-        Self { close_outputs: 0, open_outputs: 0, grip_ns: 800_000_000, max_turn_rad: 1.6, speed_share: 0.5 }
+        Self {
+            close_outputs: 0,
+            open_outputs: 0,
+            grip_ns: 800_000_000,
+            close_on_arrival: false,
+            max_turn_rad: 1.6,
+            speed_share: 0.5,
+        }
     }
 }
 

@@ -76,8 +76,9 @@ impl fmt::Display for ClientError {
             }
             ClientError::InUse(field) => write!(
                 f,
-                "`{field}` is held by another RTDE client (IN_USE): end the other program; if it has just crashed, wait for \
-                 its connection to close; registers below 24 belong to EtherNet/IP or PROFINET"
+                "`{field}` is held by another RTDE client (IN_USE), likely {}: end it; if it has just crashed, its hold ends with \
+                 its connection",
+                likely_owner(*field)
             ),
             ClientError::WrongType { field, found } => {
                 write!(f, "`{field}` is {found} on this controller, {} was expected", field.kind())
@@ -95,6 +96,21 @@ impl fmt::Display for ClientError {
             ClientError::Recipe(e) => e.fmt(f),
             ClientError::NameList => write!(f, "the names of a recipe are longer than {MAX_NAME_LIST} bytes"),
         }
+    }
+}
+
+/// Who usually holds an input that is in use.
+fn likely_owner(field: Field) -> &'static str {
+    match field.stem() {
+        // Integer and float registers below 24 and bits below 64 are a fieldbus's as soon as one is enabled.
+        ("input_int_register_" | "input_double_register_", Some(0..24)) | ("input_bit_register_", Some(0..64)) => {
+            "an EtherNet/IP or PROFINET adapter (disable it in the installation), or a program that uses the lower registers"
+        }
+        ("input_int_register_" | "input_double_register_" | "input_bit_register_", _) => {
+            "another graspd, a ROS driver, an ur_rtde program with the upper range, or a URCap"
+        }
+        ("external_force_torque", _) => "a force sensor's URCap or an ur_rtde program",
+        _ => "a ROS driver, an ur_rtde program, a URCap, or an EtherNet/IP or PROFINET adapter",
     }
 }
 
@@ -219,7 +235,8 @@ impl Session {
     pub fn frequency_hz(&self) -> f64 {
         let max = self.controller.map_or(500.0, |v| v.max_frequency_hz());
         match (self.version, self.frequency_hz) {
-            (Version::V1, _) => 125.0,
+            // Version 1 knows no frequency: the controller sends as fast as it steps.
+            (Version::V1, _) => max,
             (Version::V2, Some(hz)) if hz.is_finite() && hz > 0.0 => hz.min(max),
             (Version::V2, _) => max,
         }

@@ -8,7 +8,8 @@
 //! 3. [`Field`] knows every variable of the protocol by name and type; a [`Recipe`] is an ordered choice of them, and a
 //!    [`Slot`] the resolved place of one value.
 //! 4. [`Session`] is the client's half of the conversation: what to send next, and what an answer means.
-//! 5. [`StateReader`] and [`CommandWriter`] are graspd's own recipes; [`GapMeter`] counts what the controller left out.
+//! 5. [`StateReader`] and [`CommandWriter`] are graspd's own recipes; [`GapMeter`] counts what the controller left out,
+//!    and [`PhaseLock`] lets a beat follow the controller's.
 //!
 //! All numbers are big-endian. A server is written with the same pieces as a client:
 //!
@@ -31,6 +32,7 @@ mod client;
 mod fields;
 mod frame;
 mod message;
+mod phase;
 mod recipe;
 mod robot;
 mod value;
@@ -41,6 +43,7 @@ pub use frame::{FrameError, Framer, HEADER, MAX_PACKAGE, Package};
 pub use message::{
     ClientMessage, ControllerMessage, ControllerVersion, Kind, Level, MessageError, NoRoom, Text, Version,
 };
+pub use phase::PhaseLock;
 pub use recipe::{Answer, Entry, Recipe, RecipeError, Slot, answers, join, names};
 pub use robot::{
     COMMAND_FIELDS, ClockStep, CommandWriter, GapMeter, SCRIPT_VERSION, STATE_FIELDS, StateReader, script_state,

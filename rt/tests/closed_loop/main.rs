@@ -296,6 +296,25 @@ fn random_requests_and_faults_never_move_an_arm_that_is_not_servoing() {
     assert!(moves >= 8, "moved in {moves} of 12 runs: a test in which nothing moves proves nothing");
 }
 
+/// The fingers close on arrival where that is wanted, never on the way, and only when asked where it is not.
+#[test]
+fn closes_on_arrival_when_that_is_wanted() {
+    for wanted in [true, false] {
+        let mut w = World::new(1, |s| {
+            s.task.close_outputs = 0x0201_0001;
+            s.task.open_outputs = 0x0201_0200;
+            s.task.close_on_arrival = wanted;
+        });
+        converge(&mut w, 20).unwrap();
+        w.run(5);
+        assert_eq!(w.outputs, if wanted { 0x0201_0001 } else { 0 });
+        assert_eq!(w.beat(Some(RequestKind::Gripper { close: true }), false).reply.unwrap().result, Ok(()));
+        w.run(5);
+        assert_eq!(w.outputs, 0x0201_0001);
+        w.judge_wire();
+    }
+}
+
 /// After convergence: close, turn the valve with the loop closed, open, retreat.
 #[test]
 fn turns_the_valve_about_its_axis_and_retreats() {

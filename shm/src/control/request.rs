@@ -28,6 +28,8 @@ pub enum Verb {
     Setpoint,
     /// 7: walk the controller out of a protective stop; ends idle.
     Recover,
+    /// 8: move the gripper's fingers; the payload is `close` or `open`.
+    Gripper,
 }
 
 impl Verb {
@@ -41,12 +43,13 @@ impl Verb {
             Verb::Reset => 5,
             Verb::Setpoint => 6,
             Verb::Recover => 7,
+            Verb::Gripper => 8,
         }
     }
 
     /// The verb of a number.
     pub fn from_number(n: u32) -> Option<Self> {
-        [Verb::Status, Verb::Arm, Verb::Servo, Verb::Stop, Verb::Reset, Verb::Setpoint, Verb::Recover]
+        [Verb::Status, Verb::Arm, Verb::Servo, Verb::Stop, Verb::Reset, Verb::Setpoint, Verb::Recover, Verb::Gripper]
             .into_iter()
             .find(|v| v.number() == n)
     }

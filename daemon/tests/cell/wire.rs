@@ -1,0 +1,93 @@
+//! The mock's wire record, read on while it grows: what was asked of the arm and what the arm did, in the order in which the mock
+//! took them. Times are the controller's own: a host that stalls the mock stalls its clock with it.
+
+use graspd_rt::rtde::Field;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::PathBuf;
+
+/// One entry of interest.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Entry {
+    /// A command with this beat and mode word.
+    Beat { beat: i32, mode: i32 },
+    /// A control step: controller time, fastest target and true joint speed (rad/s), and when the mock took it (ns).
+    Step { clock_s: f64, target: f64, speed: f64, at_ns: u64 },
+    /// An event in words.
+    Note(String),
+}
+
+/// A reader that remembers where it was.
+pub(crate) struct Wire {
+    path: PathBuf,
+    at: u64,
+    rest: Vec<u8>,
+}
+
+impl Wire {
+    pub(crate) fn open(path: PathBuf) -> Self {
+        Self { path, at: 8, rest: Vec::new() }
+    }
+
+    /// Everything that came since the last call.
+    pub(crate) fn read(&mut self) -> Vec<Entry> {
+        let mut file = std::fs::File::open(&self.path).unwrap();
+        file.seek(SeekFrom::Start(self.at)).unwrap();
+        self.at += file.read_to_end(&mut self.rest).unwrap() as u64;
+        let (mut out, mut used) = (Vec::new(), 0);
+        while let Some((entry, n)) = parse(self.rest.get(used..).unwrap_or_default()) {
+            out.extend(entry);
+            used += n;
+        }
+        self.rest.drain(..used);
+        out
+    }
+}
+
+fn f64_at(b: &[u8], i: usize) -> f64 {
+    f64::from_le_bytes(b[i..i + 8].try_into().unwrap())
+}
+
+fn fastest(b: &[u8], i: usize) -> f64 {
+    (0..6).fold(0.0, |m: f64, k| m.max(f64_at(b, i + 8 * k).abs()))
+}
+
+/// The first record and its length; `None` while it is not whole.
+fn parse(b: &[u8]) -> Option<(Option<Entry>, usize)> {
+    match *b.first()? {
+        b'I' => input(b),
+        b'S' => {
+            let n = 1 + 8 + 8 + 4 * 48 + 3;
+            let b = b.get(..n)?;
+            let at_ns = u64::from_le_bytes(b[1..9].try_into().unwrap());
+            let step =
+                Entry::Step { clock_s: f64_at(b, 9), target: fastest(b, 17 + 48), speed: fastest(b, 17 + 144), at_ns };
+            Some((Some(step), n))
+        }
+        b'N' => {
+            let n = 11 + usize::from(u16::from_le_bytes(b.get(9..11)?.try_into().unwrap()));
+            let text = String::from_utf8_lossy(b.get(11..n)?).into_owned();
+            Some((Some(Entry::Note(text)), n))
+        }
+        other => panic!("the wire record has no records of kind {other}"),
+    }
+}
+
+fn input(b: &[u8]) -> Option<(Option<Entry>, usize)> {
+    let number = |name| Field::input(name).unwrap().index() as u16;
+    let (mode_field, beat_field) = (number("input_int_register_24"), number("input_int_register_25"));
+    let (mut n, mut beat, mut mode) = (18, None, 0);
+    for _ in 0..*b.get(17)? {
+        let field = u16::from_le_bytes(b.get(n..n + 2)?.try_into().unwrap());
+        let length = usize::from(*b.get(n + 2)?);
+        let value = b.get(n + 3..n + 3 + length)?;
+        // Values stand in the record as they stood on the wire: network order.
+        let word = || i32::from_be_bytes(value.try_into().unwrap());
+        if field == beat_field {
+            beat = Some(word());
+        } else if field == mode_field {
+            mode = word();
+        }
+        n += 3 + length;
+    }
+    Some((beat.map(|beat| Entry::Beat { beat, mode }), n))
+}

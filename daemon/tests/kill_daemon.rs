@@ -1,0 +1,202 @@
+//! SIGKILL and SIGSTOP of the real daemon at random instants of the motion: the arm rests within 50 ms and its ramp, by the mock's
+//! wire record and on the mock's own clock, and a daemon that is let go again moves nothing and names the reason.
+//!
+//! A few of each by default; `GRASPD_KILLS=100 cargo test --release -p graspd --test kill_daemon -- --nocapture` for the full run,
+//! `GRASPD_MOTION=position` for the same with `servoj`.
+#![cfg(feature = "demo")]
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test: a failure is to be seen at once
+
+mod cell;
+#[path = "cell/wire.rs"]
+mod wire;
+
+use cell::{Extra, Process, World, ask};
+use rustix::process::Signal;
+use std::collections::BTreeMap;
+use std::time::Duration;
+use wire::{Entry, Wire};
+
+/// Without a beat for this long the arm must be slowing down, s.
+const REACTION_S: f64 = 0.050;
+/// Slower than this is rest, rad/s.
+const REST: f64 = 1e-3;
+/// Deceleration of the ramp, rad/s2: `limits.joint_accel_rad_s2`.
+const RAMP: f64 = 4.0;
+/// What the drives need behind their targets until they rest, s.
+const SETTLE_S: f64 = 0.070;
+
+/// How one stop went, by the wire record.
+#[derive(Clone, Copy, Debug)]
+struct Stop {
+    /// Fastest joint's target speed at the last beat, rad/s.
+    speed: f64,
+    /// From the last beat to the first step of the ramp, s.
+    reaction_s: f64,
+    /// From there to rest, s.
+    ramp_s: f64,
+}
+
+/// Judges what follows the last beat of `entries`; in words why this was no stop out of motion.
+fn judge(entries: &[Entry]) -> Result<Stop, String> {
+    let mut last = (None, 0);
+    for (i, e) in entries.iter().enumerate() {
+        if let Entry::Beat { beat, .. } = e
+            && last.0 != Some(*beat)
+        {
+            last = (Some(*beat), i);
+        }
+    }
+    let steps = |part: &[Entry]| -> Vec<(f64, f64, f64)> {
+        part.iter()
+            .filter_map(|e| match e {
+                Entry::Step { clock_s, target, speed, .. } => Some((*clock_s, *target, *speed)),
+                _ => None,
+            })
+            .collect()
+    };
+    let (before, after) = entries.split_at(last.1);
+    // The step that takes the last beat is the first one after it.
+    let beat = steps(before).last().copied().ok_or("no step before the last beat")?;
+    let after = steps(after);
+    let speed = after.first().ok_or("no step after the last beat")?.1;
+    if speed < 0.02 {
+        return Err(format!("the arm stood still or crept: {speed:.4} rad/s"));
+    }
+    let rest = after.iter().position(|s| s.1 < REST && s.2 < REST);
+    let rest = rest.ok_or_else(|| format!("NOT AT REST within {:.3} s", after.last().map_or(0.0, |s| s.0) - beat.0))?;
+    if let Some(again) = after[rest..].iter().find(|s| s.1 >= REST || s.2 >= 5.0 * REST) {
+        return Err(format!("MOVED AGAIN: {again:?}"));
+    }
+    // Back from rest along the slope: the ramp begins where the speed was last held.
+    let begin = (1..=rest).rev().find(|&k| after[k].1 > REST && after[k - 1].1 < after[k].1 + 0.3 * RAMP * 0.002);
+    let begin = begin.unwrap_or(0);
+    let reaction_s = after[begin].0 - beat.0;
+    if reaction_s < 0.010 {
+        return Err(format!("it was being stopped already: the ramp began after {:.0} ms", reaction_s * 1e3));
+    }
+    Ok(Stop { speed, reaction_s, ramp_s: after[rest].0 - after[begin].0 })
+}
+
+/// Repeatable randomness.
+struct Random(u64);
+
+impl Random {
+    fn within(&mut self, low: f64, high: f64) -> f64 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        low + (high - low) * ((self.0 >> 11) as f64 / (1u64 << 53) as f64)
+    }
+}
+
+/// What was seen.
+#[derive(Default)]
+struct Tally {
+    stops: BTreeMap<&'static str, Vec<Stop>>,
+    reasons: BTreeMap<String, u32>,
+    passed_over: BTreeMap<String, u32>,
+}
+
+impl Tally {
+    /// Takes one verdict. What no stopped arm may do fails; an instant without motion is passed over.
+    fn note(&mut self, signal: &'static str, verdict: Result<Stop, String>) -> bool {
+        match verdict {
+            Ok(s) => {
+                let n = self.stops.get(signal).map_or(0, Vec::len) + 1;
+                println!(
+                    "{signal} {n}: {:.3} rad/s, ramp after {:.0} ms, rest {:.0} ms later",
+                    s.speed,
+                    s.reaction_s * 1e3,
+                    s.ramp_s * 1e3
+                );
+                assert!(s.reaction_s <= REACTION_S + 1e-9, "{signal}: {s:?}");
+                assert!(s.ramp_s <= s.speed / RAMP + SETTLE_S, "{signal}: {s:?}");
+                self.stops.entry(signal).or_default().push(s);
+                true
+            }
+            Err(e) => {
+                assert!(!e.starts_with(char::is_uppercase), "{signal}: {e}");
+                println!("{signal}: passed over, {e}");
+                *self.passed_over.entry(e.split(':').next().unwrap_or_default().to_owned()).or_default() += 1;
+                false
+            }
+        }
+    }
+
+    fn print(&self) {
+        for (signal, stops) in &self.stops {
+            let column = |name: &str, value: &dyn Fn(&Stop) -> f64| {
+                let mut v: Vec<f64> = stops.iter().map(value).collect();
+                v.sort_by(f64::total_cmp);
+                println!("{signal} {name}: min {:.1}  median {:.1}  max {:.1}", v[0], v[v.len() / 2], v[v.len() - 1]);
+            };
+            println!("{signal}: {} stops out of motion, all in bound", stops.len());
+            column("speed at the last beat, mrad/s", &|s| s.speed * 1e3);
+            column("last beat to ramp, ms", &|s| s.reaction_s * 1e3);
+            column("ramp to rest, ms", &|s| s.ramp_s * 1e3);
+            column("last beat to rest, ms", &|s| (s.reaction_s + s.ramp_s) * 1e3);
+        }
+        println!("named after SIGCONT: {:?}", self.reasons);
+        println!("instants passed over: {:?}", self.passed_over);
+    }
+}
+
+/// The daemon comes back from a freeze: the arm stays where it is, and the reason has a code. Then an operator leads it back to idle.
+fn let_go(world: &World, daemon: &Process, wire: &mut Wire, tally: &mut Tally) {
+    daemon.signal(Signal::CONT);
+    std::thread::sleep(Duration::from_millis(500));
+    let (state, cause) = world.state();
+    assert_eq!(state, "fault", "after SIGCONT: {cause}");
+    let code = cause.split(':').next().unwrap_or_default();
+    assert!(code.starts_with("F-"), "a fault has a code: {cause}");
+    *tally.reasons.entry(code.to_owned()).or_default() += 1;
+    world.insist(&["recover"]);
+    world.insist(&["reset"]);
+    std::thread::sleep(Duration::from_millis(100));
+    let moved = wire.read().into_iter().find(|e| matches!(e, Entry::Step { target, .. } if *target >= REST));
+    assert_eq!(moved, None, "nothing moves by being let go, recovered or reset");
+}
+
+#[test]
+fn the_arm_rests_in_bound_whenever_the_daemon_is_killed_or_frozen() {
+    let number = |name: &str| std::env::var(name).ok().and_then(|v| v.parse::<usize>().ok());
+    let count = number("GRASPD_KILLS").unwrap_or(2);
+    let mut random = Random(number("GRASPD_SEED").unwrap_or(20) as u64);
+    let motion = std::env::var("GRASPD_MOTION").unwrap_or_else(|_| "velocity".to_owned());
+    let world = World::with(11, Extra { frame_rate: 30.0, arm: format!("motion = \"{motion}\"\n"), record: true });
+    let mock = world.mock();
+    let scene = world.scene();
+    let mut wire = Wire::open(world.folder.join("wire"));
+    let mut tally = Tally::default();
+    let (mut killed, mut frozen) = (0, 0);
+    for _ in 0..4 * count + 8 {
+        if killed >= count && frozen >= count {
+            break;
+        }
+        // Every life begins at the start of the way.
+        ask(&mock, &format!(r#"{{"cmd":"teleport","q":[{}]}}"#, world.joints));
+        let mut daemon = world.daemon();
+        if frozen < count {
+            world.servo(Duration::from_secs_f64(random.within(0.3, 2.2)));
+            daemon.signal(Signal::STOP);
+            std::thread::sleep(Duration::from_millis(700));
+            if !tally.note("SIGSTOP", judge(&wire.read())) {
+                daemon.kill();
+                continue;
+            }
+            frozen += 1;
+            let_go(&world, &daemon, &mut wire, &mut tally);
+        }
+        if killed < count {
+            world.servo(Duration::from_secs_f64(random.within(0.3, 2.2)));
+            daemon.kill();
+            std::thread::sleep(Duration::from_millis(700));
+            killed += usize::from(tally.note("SIGKILL", judge(&wire.read())));
+        }
+        daemon.kill();
+        wire.read();
+    }
+    tally.print();
+    assert_eq!((killed, frozen), (count, count), "too few instants out of motion");
+    let folder = world.folder.clone();
+    drop((mock, scene));
+    let _ = std::fs::remove_dir_all(folder);
+}
