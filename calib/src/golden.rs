@@ -189,15 +189,24 @@ fn options(sigma: f64) -> Options {
 
 /// Tells from the points themselves whether they scatter across the contour only.
 ///
-/// A case does not say. Points taken at equal steps along a contour keep their step to far better than they scatter across it when the
+/// A case does not say. Points taken at regular steps along a contour keep their step to far better than they scatter across it when the
 /// noise is across only; isotropic noise spoils the step as much as the distance. Irregular points count as isotropic.
 fn scatter(points: &[Vec<EdgePoint>; 2]) -> Scatter {
     let across = points.iter().all(|list| {
         let Ok(fit) = fit_ml(list, Scatter::Isotropic) else { return false };
         let feet: Vec<Vector2<f64>> = list.iter().map(|p| foot(&fit.conic, &p.uv)).collect();
         let steps: Vec<f64> = feet.windows(2).map(|w| (w[1] - w[0]).norm()).collect();
-        let jumps: Vec<f64> = steps.windows(2).map(|w| w[1] - w[0]).collect();
-        let along = (jumps.iter().map(|j| j * j).sum::<f64>() / (6.0 * jumps.len().max(1) as f64)).sqrt();
+        // Equal steps in angle lengthen and shorten along an ellipse; every difference more takes away what is smooth and leaves the noise,
+        // its variance times (2k choose k) for the k-th difference of the places.
+        let mut differences = steps;
+        let mut along = f64::INFINITY;
+        for (order, gain) in [(2, 6.0), (3, 20.0), (4, 70.0), (5, 252.0), (6, 924.0)] {
+            differences = differences.windows(2).map(|w| w[1] - w[0]).collect();
+            let mean = differences.iter().map(|d| d * d).sum::<f64>() / differences.len().max(1) as f64;
+            if order % 2 == 0 && list.len() >= 5 * order {
+                along = along.min((mean / gain).sqrt());
+            }
+        }
         let scattered =
             (list.iter().map(|p| distance(&fit.conic, &p.uv).powi(2)).sum::<f64>() / list.len() as f64).sqrt();
         // One step's length scatters by a fifth where there are twenty of them.

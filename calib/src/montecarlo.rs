@@ -327,7 +327,7 @@ mod tests {
     #[test]
     fn the_bound_is_reached_and_the_covariance_is_honest() {
         // Few trials: wide limits that a wrong covariance or an inefficient estimator still breaks.
-        for name in ["nominal", "rim 50 %", "outliers 20 %"] {
+        for name in ["nominal", "rim 50 %", "outliers 20 %", "30 % hidden, outliers 20 %"] {
             let cell = cells().into_iter().find(|c| c.name == name).unwrap();
             let (circle, ellipse) = run(&cell, 150, 99);
             for o in [circle.unwrap(), ellipse] {
