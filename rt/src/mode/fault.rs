@@ -169,6 +169,21 @@ impl FaultCause {
     }
 }
 
+/// The control script's fault words (docs/RTDE-REGISTERS.md).
+const fn script_fault(word: i32) -> &'static str {
+    match word {
+        1 => "a joint rate is not a number or above its limit",
+        2 => "the acceleration is not a number or out of range",
+        3 => "unknown mode word",
+        4 => "it heard no new set-point in time: check the network",
+        5 => "somebody else writes its registers",
+        6 => "the outputs word means nothing",
+        7 => "a joint target is not a number or too far away",
+        8 => "nobody shook hands in time",
+        _ => "a fault that this version does not know",
+    }
+}
+
 /// In words, with the figures, and what to do. Formatting happens outside the loop.
 impl fmt::Display for FaultCause {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -219,7 +234,9 @@ impl fmt::Display for FaultCause {
             FaultCause::ProgramStopped { runtime_state } => {
                 write!(f, "the control script was stopped or paused (runtime_state {runtime_state})")
             }
-            FaultCause::ScriptFault { word } => write!(f, "the control script reports fault {word}"),
+            FaultCause::ScriptFault { word } => {
+                write!(f, "the control script reports fault {word}: {}", script_fault(*word))
+            }
             FaultCause::TokenChanged { expected, found } => {
                 write!(f, "another program commands the robot (token {found}, ours is {expected})")
             }

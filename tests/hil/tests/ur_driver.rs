@@ -11,6 +11,8 @@ use std::net::{TcpListener, TcpStream};
 use std::time::{Duration, Instant};
 
 const LIMIT: Duration = Duration::from_secs(30);
+/// How long the script waits for the next message: a host that stalls is not the robot's fault.
+const PATIENCE_MS: i32 = 20_000;
 const START: [f64; 6] = [0.3, -1.4, 1.5, -1.2, -1.4, 0.2];
 
 fn host() -> Hosted {
@@ -267,8 +269,7 @@ impl Driver {
     ) -> Json {
         let begin = Instant::now();
         loop {
-            // The script waits two seconds for the next one: a host that stalls is not the robot's fault.
-            self.reverse.write_all(&reverse(2000, values, mode)).unwrap();
+            self.reverse.write_all(&reverse(PATIENCE_MS, values, mode)).unwrap();
             let now = state(mock);
             if done(&now) {
                 return now;
@@ -287,7 +288,7 @@ impl Driver {
         while bytes.len() < 4 {
             assert!(begin.elapsed() < LIMIT, "the path has no end: {}", state(mock));
             // Neither a new path nor a cancel: the message only says that we live.
-            self.reverse.write_all(&reverse(2000, [0.0; 6], 3)).unwrap();
+            self.reverse.write_all(&reverse(PATIENCE_MS, [0.0; 6], 3)).unwrap();
             match self.path.read(&mut buffer) {
                 Ok(0) => panic!("the script closed its path socket"),
                 Ok(n) => bytes.extend_from_slice(&buffer[..n]),
@@ -301,7 +302,7 @@ impl Driver {
     }
 
     fn send_path(&mut self, points: &[Vec<u8>]) {
-        let mut head = vec![2000, 1, points.len() as i32];
+        let mut head = vec![PATIENCE_MS, 1, points.len() as i32];
         head.resize(7, 0);
         head.push(3);
         self.reverse.write_all(&words(&head)).unwrap();
@@ -333,7 +334,7 @@ fn a_drivers_script_is_streamed_to_in_every_mode() {
     let mut far = goal;
     far[0] += 1.0;
     for _ in 0..20 {
-        d.reverse.write_all(&reverse(2000, far, 1)).unwrap();
+        d.reverse.write_all(&reverse(PATIENCE_MS, far, 1)).unwrap();
         std::thread::sleep(Duration::from_millis(2));
     }
     assert!(near(six(&state(&mut mock), "actual_q"), goal, 2e-2));
@@ -377,17 +378,17 @@ fn a_drivers_script_is_streamed_to_in_every_mode() {
         d.command.write_all(&words(&other)).unwrap();
     }
     // A path that is given up half way.
-    d.send_path(&[point(with([-0.8, 0.0, 0.0, 0.0, 0.0, 0.0]), [0.0; 6], [0.3, 1.0, 0.0], 0.0, 0)]);
-    until("the long way", &mut mock, |s| six(s, "target_qd")[0] < -0.1);
-    d.reverse.write_all(&words(&[2000, -1, 0, 0, 0, 0, 0, 3])).unwrap();
+    d.send_path(&[point(with([-0.8, 0.0, 0.0, 0.0, 0.0, 0.0]), [0.0; 6], [0.05, 1.0, 0.0], 0.0, 0)]);
+    until("the long way", &mut mock, |s| six(s, "target_qd")[0] < -0.04);
+    d.reverse.write_all(&words(&[PATIENCE_MS, -1, 0, 0, 0, 0, 0, 3])).unwrap();
     assert_eq!(read_int(&mut d.path), 1, "canceled");
     until("rest", &mut mock, |s| s["at_rest"] == true);
     assert!(six(&state(&mut mock), "actual_q")[0] > c[0] - 0.9);
     // Freedrive on and off, then the end in good order.
-    d.reverse.write_all(&words(&[2000, 1, 0, 0, 0, 0, 0, 6])).unwrap();
-    d.reverse.write_all(&words(&[2000, -1, 0, 0, 0, 0, 0, 6])).unwrap();
+    d.reverse.write_all(&words(&[PATIENCE_MS, 1, 0, 0, 0, 0, 0, 6])).unwrap();
+    d.reverse.write_all(&words(&[PATIENCE_MS, -1, 0, 0, 0, 0, 0, 6])).unwrap();
     assert_eq!(state(&mut mock)["program_running"], true);
-    d.reverse.write_all(&reverse(2000, [0.0; 6], -2)).unwrap();
+    d.reverse.write_all(&reverse(PATIENCE_MS, [0.0; 6], -2)).unwrap();
     until("the end", &mut mock, |s| s["program_running"] == false);
     assert_eq!(mock.ask(&Command::Summary).unwrap()["limit_violations"], 0);
 }

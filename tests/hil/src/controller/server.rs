@@ -299,6 +299,11 @@ impl Server {
     }
 }
 
+/// A line for whoever started the program; where nobody listens it is lost.
+fn tell(text: &str) {
+    let _ = std::io::Write::write_fmt(&mut std::io::stderr(), format_args!("graspd-mock-ur: {text}\n"));
+}
+
 /// Reads what came on a connection and deals with it.
 fn receive(c: &mut Connection, world: &mut World, buffer: &mut [u8], now: u64) {
     let Some(bytes) = c.read(buffer).map(<[u8]>::to_vec) else { return };
@@ -340,7 +345,11 @@ fn receive(c: &mut Connection, world: &mut World, buffer: &mut [u8], now: u64) {
             Ok(uploads) => {
                 for upload in uploads {
                     match upload {
-                        Upload::Program(text) => world.upload(now, &text),
+                        Upload::Program(text) => {
+                            if let super::program::Upload::Refused(reason) = world.upload(now, &text) {
+                                tell(&format!("script refused: {reason}"));
+                            }
+                        }
                         Upload::StopProgram => {
                             world.note(now, "stop program");
                             world.robot.stop_program();

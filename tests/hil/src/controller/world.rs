@@ -88,16 +88,11 @@ impl World {
     }
 
     /// A script came in.
-    pub fn upload(&mut self, now_ns: u64, text: &str) {
+    pub fn upload(&mut self, now_ns: u64, text: &str) -> Upload {
         let outcome = self.robot.upload(text);
         let first = text.lines().find(|l| !l.trim().is_empty()).unwrap_or("");
         self.note(now_ns, &format!("script {outcome:?}: {first}"));
-        if let Upload::Refused(reason) = outcome {
-            let _ = std::io::Write::write_fmt(
-                &mut std::io::stderr(),
-                format_args!("graspd-mock-ur: script refused: {reason}\n"),
-            );
-        }
+        outcome
     }
 
     /// Faults of one port's wires.
@@ -187,7 +182,11 @@ impl World {
                 }
             }
             Command::StopProgram => robot.stop_program(),
-            Command::Script { text } => self.upload(now_ns, &text),
+            Command::Script { text } => {
+                if let Upload::Refused(reason) = self.upload(now_ns, &text) {
+                    return Err(reason);
+                }
+            }
             Command::NanPosition { joint } => robot.report_fault.nan_position = Some(joint),
             Command::NanSpeed { joint } => robot.report_fault.nan_speed = Some(joint),
             Command::Jump { joint, rad, seconds } => {
