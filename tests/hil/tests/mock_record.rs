@@ -99,7 +99,7 @@ fn a_record_is_what_the_documentation_says() {
     ];
     assert_eq!(inputs, expected);
     assert_eq!((modes[0], modes.last().copied().unwrap()), ([7, 1, 1], [7, 3, 1]), "running, normal, then stopped");
-    for part in ["connection 2 Rtde", "protective_stop", "stopped"] {
+    for part in [" Rtde from ", "protective_stop", "stopped"] {
         assert!(notes.iter().any(|n| n.contains(part)), "{part}: {notes:?}");
     }
     // And the reader that ships says the same.
