@@ -48,7 +48,7 @@ fn any_process_may_be_killed_in_motion() {
     std::thread::sleep(Duration::from_secs(1));
     assert_ne!(world.state().0, "servoing", "pictures that come back start nothing");
     if world.state().0 == "fault" {
-        world.insist(&["reset"]);
+        world.clear();
     }
 
     // The controller: a named reason, the others alive.

@@ -168,7 +168,7 @@ fn let_go(world: &World, daemon: &Process, wire: &mut Wire, tally: &mut Tally) {
     assert!(code.starts_with("F-"), "a fault has a code: {cause}");
     *tally.reasons.entry(code.to_owned()).or_default() += 1;
     world.insist(&["recover"]);
-    world.insist(&["reset"]);
+    world.clear();
     std::thread::sleep(Duration::from_millis(100));
     let moved = wire.read().into_iter().find(|e| matches!(e, Entry::Step { target, .. } if *target >= REST));
     assert_eq!(moved, None, "nothing moves by being let go, recovered or reset");

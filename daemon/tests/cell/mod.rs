@@ -177,6 +177,15 @@ impl World {
         }
     }
 
+    /// Clears a fault. A host that stalls may have ended the control script meanwhile; then the robot is recovered first.
+    pub(crate) fn clear(&self) {
+        let until = Instant::now() + Duration::from_secs(60);
+        while !self.verb(&["reset"]).0 {
+            assert!(Instant::now() < until, "the fault stays: {:?}", self.state());
+            self.verb(&["recover"]);
+        }
+    }
+
     pub(crate) fn state(&self) -> (String, String) {
         let (_, said) = self.verb(&["status"]);
         let text = |key: &str| said.get(key).and_then(Value::as_str).unwrap_or("").to_owned();
