@@ -4,6 +4,7 @@ use super::args::PlanArgs;
 use crate::exit::{Exit, Failure};
 use graspd_calib::mesh_cli::parse_pose;
 use graspd_calib::plan_cli::{Class, Outcome, Request, run};
+use std::io::Write as _;
 
 /// Runs it.
 ///
@@ -53,12 +54,12 @@ pub fn plan(args: &PlanArgs) -> Result<Exit, Failure> {
 /// Prints what came out; the class says with which code the program ends.
 fn finish(args: &PlanArgs, outcome: Outcome) -> Result<Exit, Failure> {
     if args.json {
-        println!("{}", outcome.json);
+        print_line(&outcome.json);
     }
     let exit = match outcome.class {
         Class::Done => {
             if !args.json {
-                println!("{}", outcome.text);
+                print_line(&outcome.text);
             }
             return Ok(Exit::Done);
         }
@@ -67,4 +68,9 @@ fn finish(args: &PlanArgs, outcome: Outcome) -> Result<Exit, Failure> {
         Class::Input => Exit::Input,
     };
     Err(Failure { exit, message: outcome.text })
+}
+
+/// Prints a line. A reader that has seen enough (`| head`) is no failure of the plan, which is written by then.
+fn print_line(line: &dyn std::fmt::Display) {
+    let _ = writeln!(std::io::stdout(), "{line}");
 }
