@@ -221,6 +221,11 @@ impl World {
         std::thread::sleep(after);
     }
 
+    /// What the daemon has logged.
+    pub(crate) fn log(&self) -> String {
+        std::fs::read_to_string(self.folder.join("graspd.log")).unwrap_or_default()
+    }
+
     /// Waits for a fault or a hold and returns its words.
     pub(crate) fn stopped(&self) -> String {
         let until = Instant::now() + Duration::from_secs(10);
