@@ -3,7 +3,7 @@
 use crate::arm::{Said, SaidKind, robot_mode, safety_words};
 use crossbeam::queue::ArrayQueue;
 use graspd_rt::cycle::{CycleRecord, Transition, Why};
-use graspd_rt::mode::ModeName;
+use graspd_rt::mode::{FaultCause, ModeName};
 use graspd_rt::setpoint::SetPoint;
 use graspd_shm::control::{Percentiles, TelemetrySample};
 use serde_json::{Value, json};
@@ -20,6 +20,7 @@ struct State {
     refused: Vec<String>,
     plan: String,
     refusal: String,
+    lasting: Option<FaultCause>,
     sample: TelemetrySample,
     rest: bool,
     /// Robot mode and safety bits when the link last looked, for the time without telemetry.
@@ -100,6 +101,12 @@ impl Report {
         let mut s = self.lock();
         s.mode = Some(record.mode);
         s.rest = record.command.rates.iter().all(|r| *r == 0.0);
+        s.lasting = record.lasting;
+    }
+
+    /// What would still be wrong after a reset, in words with its code.
+    pub fn lasting(&self) -> Option<String> {
+        self.lock().lasting.map(|cause| format!("{}: {cause}", cause.code()))
     }
 
     /// Notes the newest telemetry.

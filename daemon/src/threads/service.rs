@@ -51,7 +51,10 @@ impl Service<'_> {
             }
             Verb::Arm => self.ask(id, RequestKind::Arm),
             Verb::Servo => self.ask(id, RequestKind::Servo),
-            Verb::Reset => self.ask(id, RequestKind::Reset),
+            Verb::Reset => self.ask(id, RequestKind::Reset).map_err(|e| match self.report.lasting() {
+                Some(cause) => format!("{e}: {cause}"),
+                None => e,
+            }),
             Verb::Setpoint => self.setpoint(&request.payload),
             Verb::Recover => self.recover(),
             Verb::Gripper => self.gripper(&request.payload, id),

@@ -153,6 +153,8 @@ pub struct CycleRecord {
     pub dt_ns: u64,
     /// Mode after the beat.
     pub mode: ModeName,
+    /// In a fault: what would still be wrong after a reset.
+    pub lasting: Option<FaultCause>,
     /// Part of the way.
     pub stage: Stage,
     /// Whether the motion is still in its slow probe.

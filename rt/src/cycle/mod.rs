@@ -530,6 +530,7 @@ impl CommandCycle {
             now_ns: now,
             dt_ns,
             mode: self.mode.name(),
+            lasting: self.mode.fault().and_then(|_| self.arm.lasting_fault(now)),
             stage: self.motion.as_ref().map_or(Stage::Pregrasp, |m| m.stage),
             probing: self.probe.is_some_and(|p| !p.passed()),
             progress: self.motion.as_ref().map_or(0.0, |m| m.reference.progress()),

@@ -273,6 +273,10 @@ impl ArmWatch {
     pub(super) fn lasting_fault(&self, now_ns: u64) -> Option<FaultCause> {
         let mut after = self.clone();
         after.event = None;
+        // The control script keeps its fault until it is told to idle, and idle is what a reset leads to.
+        if let Some(state) = &mut after.state {
+            state.script_fault = 0;
+        }
         after.fault(now_ns, false)
     }
 }

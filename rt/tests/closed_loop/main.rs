@@ -4,6 +4,7 @@
 mod heap;
 mod world;
 
+use graspd_rt::arm::ArmMode;
 use graspd_rt::cycle::{CommandCycle, CycleSettings, RequestKind, Stage, WatchSettings, Why};
 use graspd_rt::geom::{Pose, Twist, exp_twist};
 use graspd_rt::mode::{FaultCause, ModeName, Reject};
@@ -179,6 +180,24 @@ fn any_fault_at_any_instant_ends_at_rest() {
             w.judge_wire();
         }
     }
+}
+
+/// The control script latches a fault of its own until it is told to idle: a reset must lead there, or nothing ever would.
+#[test]
+fn a_reset_ends_the_scripts_own_fault() {
+    let mut w = World::new(7, |_| {});
+    w.start();
+    w.run(500);
+    w.faults.script_fault = true;
+    w.run(400);
+    assert_eq!(w.cycle.mode().fault().unwrap().cause.code(), "F-ARM-11");
+    let out = w.beat(Some(RequestKind::Reset), false);
+    assert_eq!((out.reply.unwrap().result, out.command.mode), (Ok(()), ArmMode::Idle));
+    // Until the script has heard it, nothing can be armed.
+    assert_eq!(w.beat(Some(RequestKind::Arm), false).reply.unwrap().result, Err(Reject::RobotNotReady));
+    w.faults.script_fault = false;
+    w.run(300);
+    assert_eq!(w.beat(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()));
 }
 
 /// A picture that stands still while the arm moves, an arm that stands still while it is told to move, one that creeps.

@@ -9,8 +9,21 @@ use thread_priority::{RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriori
 pub(crate) const CONTROLLER: u8 = 92;
 /// Of the camera's look at the arm, which gives every picture its joints.
 pub(crate) const EXPOSURE: u8 = 90;
-/// Of rendering: below every thread of the daemon, above all ordinary programs.
-pub(crate) const RENDERER: u8 = 2;
+
+/// Niceness of rendering. It takes a third of a processor, and the kernel stops *all* real-time threads of a processor for 50 ms when
+/// they take more than 95 % of a second: so it may ask for precedence among ordinary programs only.
+pub(crate) const RENDERER: i32 = -10;
+
+/// Asks for niceness against everything else on the host. Where the kernel schedules whole sessions against each other, that takes a
+/// session of one's own.
+pub(crate) fn prefer_this_process(nice: i32) {
+    let _ = rustix::process::setsid();
+    let own_session = rustix::process::getsid(None).is_ok_and(|s| s == rustix::process::getpid());
+    if own_session {
+        let _ = std::fs::write("/proc/self/autogroup", nice.to_string());
+    }
+    let _ = rustix::process::setpriority_process(None, nice);
+}
 
 /// Puts the calling thread under SCHED_FIFO, or, where an ordinary user may not ask for that, asks for the niceness `nice` instead.
 /// Best effort: on a quiet host neither is needed.

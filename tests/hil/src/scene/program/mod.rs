@@ -90,6 +90,8 @@ fn run(args: &Args) -> Result<(), SceneError> {
     if !(0.5..=500.0).contains(&args.rate) {
         return Err(SceneError::Rate(args.rate));
     }
+    // A camera keeps its rate on a busy host.
+    crate::host::prefer_this_process(crate::host::RENDERER);
     let scenario = match (&args.world, args.seed) {
         (Some(dir), _) => Scenario::load(dir)?,
         (None, Some(seed)) => Scenario::from_seed(seed, &args.options())?,
@@ -127,8 +129,6 @@ fn run(args: &Args) -> Result<(), SceneError> {
     if let Some(address) = &args.rtde {
         arm.follow(address.clone(), Arc::clone(&stop));
     }
-    // A camera keeps its rate on a busy host, and takes no time from the controller's processor.
-    crate::host::prefer_this_thread(crate::host::RENDERER, -8);
     let renderer = scenario.renderer();
     let node = create_node(&names, "graspd-scene")?;
     let seed = scenario.seed;
