@@ -139,7 +139,9 @@ fn main() {
 }
 
 fn soak(config: &Config, seconds: f64, mock: u32, record: &Path) -> i32 {
-    let ur = ur_config(config);
+    let mut ur = ur_config(config);
+    // A host that stalls for 50 ms must not end the script, and with it the measurement.
+    ur.watchdog_ms = 1000.0;
     let mut link = UrLink::connect(&ur).unwrap();
     link.bring_up(&ur).unwrap();
     let period_s = config.period_ns() as f64 * 1e-9;
