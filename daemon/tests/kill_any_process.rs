@@ -94,7 +94,7 @@ fn any_process_may_be_killed_at_any_moment_of_the_motion() {
         std::thread::sleep(Duration::from_millis(500));
         assert_ne!(world.state().0, "servoing", "pictures that come back start nothing");
         if world.state().0 == "fault" {
-            world.insist(&["reset"]);
+            world.clear();
         }
         rewind(&world, &mock);
 
@@ -113,7 +113,7 @@ fn any_process_may_be_killed_at_any_moment_of_the_motion() {
         mock = world.mock();
         std::thread::sleep(Duration::from_secs(3));
         assert_eq!(episodes(&mock), 0, "a controller that comes back is not moved");
-        world.insist(&["reset"]);
+        world.clear();
     }
     drop((daemon, scene, mock));
     let _ = std::fs::remove_dir_all(&world.folder);

@@ -232,11 +232,12 @@ fn the_controller_is_heard_saying_why_it_stopped_and_its_popups_are_closed() {
     mock.ask(&Command::Script { text: "def broken():\n  nothing_of_this_name()\nend\n".into() }).unwrap();
     let text = hear(&mut ear, SaidKind::Program);
     assert!(text.contains("line 2"), "{text}");
+    mock.ask(&Command::Script { text: "popup(\"look here\", title=\"Stop\")\n".into() }).unwrap();
+    std::thread::sleep(Duration::from_millis(100));
     mock.ask(&Command::Collision { force: 80.0 }).unwrap();
     assert_eq!(hear(&mut ear, SaidKind::Safety), "protective stop (C153A0)");
     // A connection that is cut is made again.
     mock.ask(&Command::Reset { port: Port::Primary }).unwrap();
-    mock.ask(&Command::Script { text: "popup(\"look here\", title=\"Stop\")\n".into() }).unwrap();
     recover(&config, 3, |_| {}).unwrap();
     std::thread::sleep(Duration::from_millis(100));
     let world = mock.stop().unwrap();

@@ -43,7 +43,7 @@ pub fn recover(config: &UrConfig, token: i32, mut tell: impl FnMut(&RecoverStep)
 }
 
 /// Walks the dashboard from wherever the robot stands to running: close popups, unlock a protective stop, power on, release the
-/// brakes. Returns the controller's step, s.
+/// brakes, stop a program that still runs. Returns the controller's step, s.
 ///
 /// Called only when an operator asks for it. It never touches an emergency stop, a safeguard or a safety fault: those are ended at
 /// the robot, and are reported.
@@ -73,6 +73,10 @@ pub fn walk_out(config: &UrConfig, times: RecoverTimes, tell: &mut impl FnMut(&R
         }
     }
     power_up(&mut dashboard, times.power_up, &mut done)?;
+    // Whatever still runs (a script of a session that died, somebody's program) stands in our script's way; a stop is what was asked for.
+    if dashboard.ask("running")?.to_ascii_lowercase().contains("true") {
+        done("stop", dashboard.demand("stop", &["Stopped"], "stop the program on the pendant")?);
+    }
     Ok(step_s)
 }
 

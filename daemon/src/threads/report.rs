@@ -104,7 +104,7 @@ impl Report {
         s.lasting = record.lasting;
     }
 
-    /// What would still be wrong after a reset, in words with its code.
+    /// What is wrong with the robot now (in a fault: what still would be after a reset), in words with its code.
     pub fn lasting(&self) -> Option<String> {
         self.lock().lasting.map(|cause| format!("{}: {cause}", cause.code()))
     }

@@ -49,12 +49,9 @@ impl Service<'_> {
             Verb::Arm | Verb::Servo | Verb::Setpoint | Verb::Gripper if stale => {
                 Err("the request is older than 250 ms and is not carried out; send it again".to_owned())
             }
-            Verb::Arm => self.ask(id, RequestKind::Arm),
-            Verb::Servo => self.ask(id, RequestKind::Servo),
-            Verb::Reset => self.ask(id, RequestKind::Reset).map_err(|e| match self.report.lasting() {
-                Some(cause) => format!("{e}: {cause}"),
-                None => e,
-            }),
+            Verb::Arm => self.ask(id, RequestKind::Arm).map_err(|e| self.with_cause(e)),
+            Verb::Servo => self.ask(id, RequestKind::Servo).map_err(|e| self.with_cause(e)),
+            Verb::Reset => self.ask(id, RequestKind::Reset).map_err(|e| self.with_cause(e)),
             Verb::Setpoint => self.setpoint(&request.payload),
             Verb::Recover => self.recover(),
             Verb::Gripper => self.gripper(&request.payload, id),
@@ -64,6 +61,14 @@ impl Service<'_> {
         }
         let reason = result.as_ref().err().map(String::as_str);
         request.answer(result.is_ok(), &self.report.json(result.is_ok(), reason, &self.marks.text()));
+    }
+
+    /// A refusal, and what is wrong with the robot if anything is.
+    fn with_cause(&self, refusal: String) -> String {
+        match self.report.lasting() {
+            Some(cause) => format!("{refusal} ({cause})"),
+            None => refusal,
+        }
     }
 
     /// A stop is answered when its ramp has begun.

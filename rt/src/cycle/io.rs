@@ -153,7 +153,7 @@ pub struct CycleRecord {
     pub dt_ns: u64,
     /// Mode after the beat.
     pub mode: ModeName,
-    /// In a fault: what would still be wrong after a reset.
+    /// While the arm is not driven: what is wrong with the robot; in a fault, what still would be after a reset.
     pub lasting: Option<FaultCause>,
     /// Part of the way.
     pub stage: Stage,

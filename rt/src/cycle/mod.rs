@@ -144,6 +144,9 @@ impl CommandCycle {
         self.gather(input);
         let mut event = None;
         let watched = !matches!(self.mode, Mode::Idle | Mode::Tracking | Mode::Fault(_));
+        if matches!(self.mode, Mode::Idle | Mode::Tracking) {
+            self.arm.outlive_event(now);
+        }
         self.arm.note_good(now, watched);
 
         // Decide: faults first, then holds, then a stop, then progress, then whatever else was asked.
@@ -530,7 +533,11 @@ impl CommandCycle {
             now_ns: now,
             dt_ns,
             mode: self.mode.name(),
-            lasting: self.mode.fault().and_then(|_| self.arm.lasting_fault(now)),
+            lasting: match self.mode {
+                Mode::Fault(_) => self.arm.lasting_fault(now),
+                Mode::Idle | Mode::Tracking | Mode::Armed => self.arm.fault(now, false),
+                Mode::Servoing | Mode::Converged | Mode::Stopping(_) => None,
+            },
             stage: self.motion.as_ref().map_or(Stage::Pregrasp, |m| m.stage),
             probing: self.probe.is_some_and(|p| !p.passed()),
             progress: self.motion.as_ref().map_or(0.0, |m| m.reference.progress()),

@@ -30,6 +30,7 @@ pub(super) struct ArmWatch {
     blocked_since_ns: Option<u64>,
     /// What the last state showed that a later one does not: a jump, a clock that went back.
     event: Option<FaultCause>,
+    event_ns: u64,
     sent: [(u64, Joints); SENT],
     sent_at: usize,
     moving_cmd_ns: u64,
@@ -48,6 +49,7 @@ impl ArmWatch {
             echo_changed_ns: 0,
             blocked_since_ns: None,
             event: None,
+            event_ns: 0,
             sent: [(0, [0.0; 6]); SENT],
             sent_at: 0,
             moving_cmd_ns: 0,
@@ -74,6 +76,7 @@ impl ArmWatch {
         let Some(new) = robot else { return false };
         if let Some(cause) = self.absurd(new) {
             self.event = Some(cause);
+            self.event_ns = now_ns;
             return false;
         }
         if self.state.is_none_or(|old| old.echo != new.echo) {
@@ -258,6 +261,13 @@ impl ArmWatch {
     /// Since when the robot has been fit to be driven.
     pub(super) fn good_for_ns(&self, now_ns: u64) -> Option<u64> {
         self.good_since_ns.map(|t| now_ns.saturating_sub(t))
+    }
+
+    /// An event while nobody claims the arm is history once the robot's values have been sane for a second: there is nothing to reset.
+    pub(super) fn outlive_event(&mut self, now_ns: u64) {
+        if now_ns.saturating_sub(self.event_ns) > 1_000_000_000 {
+            self.event = None;
+        }
     }
 
     /// Forgets what a reset may forget: events of the past, not conditions of the present.

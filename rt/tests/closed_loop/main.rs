@@ -182,6 +182,25 @@ fn any_fault_at_any_instant_ends_at_rest() {
     }
 }
 
+/// A value that jumps while nobody claims the arm refuses arming while it is fresh, and nothing has to be reset afterwards.
+#[test]
+fn a_glitch_while_idle_is_outlived() {
+    let mut w = World::new(9, |_| {});
+    w.start();
+    w.beat(Some(RequestKind::Stop), false);
+    w.run(800);
+    assert_eq!(w.cycle.mode().name(), ModeName::Tracking);
+    w.faults.jump_state = true;
+    w.run(20);
+    w.faults.jump_state = false;
+    w.run(100);
+    let out = w.beat(Some(RequestKind::Arm), false);
+    assert_eq!(out.reply.unwrap().result, Err(Reject::RobotNotReady));
+    assert_eq!(out.record.lasting.unwrap().code(), "F-ARM-16");
+    w.run(1_200);
+    assert_eq!(w.beat(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()));
+}
+
 /// The control script latches a fault of its own until it is told to idle: a reset must lead there, or nothing ever would.
 #[test]
 fn a_reset_ends_the_scripts_own_fault() {
