@@ -14,9 +14,9 @@ use super::sharpen::{lens_blur, sharpen};
 use graspd_rt::geom::{Camera, Pixel};
 
 /// Edges closer together than this share most of their pixels (2 sqrt(pi) times the smoothing), so that they count as one.
-const INDEPENDENT_PX: f64 = 3.5;
+pub(super) const INDEPENDENT_PX: f64 = 3.5;
 /// Uncertainty of an edge that no pixel noise explains: lens residue, detector non-uniformity, the rim's own roughness.
-const FLOOR_PX: f64 = 0.03;
+pub(super) const FLOOR_PX: f64 = 0.03;
 /// Edges that scatter more about their ellipse belong to several contours. A round bar's outline, which is none, stays below half of it.
 const MOST_SCATTER_PX: f64 = 0.9;
 /// Smallest part of an ellipse that has to carry edges.
@@ -37,6 +37,7 @@ pub struct ViewEdges<'a> {
     samples: Vec<Vec<u32>>,
     /// Arcs by falling length.
     longest: Vec<u32>,
+    blur: std::cell::OnceCell<f64>,
 }
 
 /// An edge point of a contour.
@@ -114,7 +115,7 @@ impl<'a> ViewEdges<'a> {
             .collect();
         let mut longest: Vec<u32> = (0..arcs.arcs.len() as u32).collect();
         longest.sort_by_key(|k| std::cmp::Reverse(arcs.arcs.get(*k as usize).map_or(0, |a| a.edges.len())));
-        Self { picture, map, arcs, lens, samples, longest }
+        Self { picture, map, arcs, lens, samples, longest, blur: std::cell::OnceCell::new() }
     }
 
     /// Trial ellipses through a seed edge, best first, at most `keep` and no two alike.
@@ -271,24 +272,6 @@ impl<'a> ViewEdges<'a> {
         Some(best)
     }
 
-    /// The same without a seed: the ellipse may settle where its edges are.
-    pub(super) fn settle_free(&self, start: Trial) -> Option<Trial> {
-        let mut best = start;
-        for k in 0..6 {
-            let mut sums = Sums::new(best.ellipse.centre, best.ellipse.a);
-            for e in best.hits.iter().filter_map(|k| self.arcs.ideal.get(*k as usize)) {
-                sums.add(e.at, 1.0);
-            }
-            let t = self.judge(&sums.ellipse()?, best.bright_inside, if k < 2 { 3.0 } else { 2.0 })?;
-            let same = alike(&t.ellipse, &best.ellipse) && t.hits.len() == best.hits.len();
-            best = t;
-            if same {
-                break;
-            }
-        }
-        Some(best)
-    }
-
     /// The contour of a trial: edges by consensus, thinned, refined, with their ellipse. `None` when too little is left.
     pub(super) fn contour(&self, trial: &Trial) -> Option<Contour> {
         let sign = if trial.bright_inside { -1.0 } else { 1.0 };
@@ -384,9 +367,14 @@ impl<'a> ViewEdges<'a> {
         points_on_one_ellipse(points, e, sign < 0.0, bins, rejected)
     }
 
+    /// Standard deviation of a sharp edge's picture, pixels; measured once.
+    pub(super) fn blur(&self) -> f64 {
+        *self.blur.get_or_init(|| lens_blur(self.picture, &self.map))
+    }
+
     /// The same contour with every edge told apart from its neighbours (see [`super::sharpen`]); the contour itself where too few can be.
     pub(super) fn sharpened(&self, c: &Contour) -> Contour {
-        let blur = lens_blur(self.picture, &self.map);
+        let blur = self.blur();
         let w = Walk::new(&c.ellipse);
         let sign = if c.bright_inside { -1.0 } else { 1.0 };
         let mut points = Vec::new();

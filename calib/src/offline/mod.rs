@@ -1,6 +1,7 @@
 //! The off-line stage, one file per step of the paper: from edge points in two views to a rim in space and a grasp on it.
 
 pub mod arcs;
+mod barsearch;
 pub mod canvas;
 pub mod circle;
 pub mod cone;
@@ -9,13 +10,14 @@ pub mod contour;
 pub mod correspondence;
 pub mod edges;
 pub mod eigen;
+mod follow;
 pub mod grasp;
 pub mod handle;
 pub mod lens;
 mod levenberg;
 pub mod ml;
 pub mod model;
-pub mod outline;
+pub mod order;
 pub mod overlay;
 pub mod pairing;
 pub mod pencil;
@@ -36,5 +38,6 @@ pub mod select;
 pub mod setpoint;
 pub mod sharpen;
 pub mod synthetic;
+mod systematic;
 pub mod torus;
 pub mod visibility;

@@ -2,14 +2,16 @@
 //!
 //! Each view's selection gives a few contours, likeliest first. Pairs are tried in the order of what they ask the operator to have meant; the first that
 //! passes every test of the reconstruction is taken. The brighter side must agree: a painted line has two edges, and the inner one of one view
-//! is never the outer one of the other. Where the rim may be a round bar, each contour's other outline is looked for first.
+//! is never the outer one of the other. Where the rim may be a round bar, the bar that has the clicked outlines is looked for, and the shape of all four
+//! outlines decides. What neither of both explains better is refused: a bar taken for a plane edge is wrong by degrees without looking so.
 
+use super::barsearch::{self, BarFound};
 use super::contour::{Contour, ViewEdges};
-use super::model::{EdgePoint, Options, Outline, Projection, Reconstruction, RimChoice, RimModel};
-use super::outline::{OtherOutline, other_outline};
-use super::reconstruct::reconstruct;
+use super::model::{Options, Outline, Projection, Reconstruction, RimChoice, RimModel};
+use super::reconstruct::{reconstruct, tolerable};
 use super::refusal::Refusal;
 use super::select::Candidate;
+use super::systematic::{Stretch, widen};
 
 /// A pair of contours that reconstructs.
 #[derive(Clone, Debug)]
@@ -36,21 +38,6 @@ pub struct Unpaired {
 /// What a difference of the brighter side costs: two pictures of one edge hardly ever differ in it, except against another background.
 const OTHER_SIDE: f64 = 12.0;
 
-/// A view's outlines in the order outer, inner.
-fn outlines<'c>(clicked: &'c Contour, other: Option<&'c OtherOutline>) -> (&'c Contour, Option<&'c Contour>) {
-    match other {
-        Some(o) if o.inside => (clicked, Some(&o.contour)),
-        Some(o) => (&o.contour, Some(clicked)),
-        None => (clicked, None),
-    }
-}
-
-fn points(outer: &Contour, inner: Option<&Contour>) -> Vec<EdgePoint> {
-    let mut all = outer.edge_points(Outline::Outer);
-    all.extend(inner.iter().flat_map(|c| c.edge_points(Outline::Inner)));
-    all
-}
-
 /// What a rim's semi-axes may differ by in the picture, pixels, before it is called an ellipse: neighbouring edges and shading move an edge by tenths of
 /// a pixel, all round alike or in step with the tilt, which no count of points averages out.
 const ROUND_PX: f64 = 1.0;
@@ -61,20 +48,18 @@ const THINNEST: f64 = 0.015;
 /// How many accepted pairs are compared; the two edges of a painted line are the usual case.
 const COMPARED: usize = 3;
 
-/// The chosen contours with their edges told apart from their neighbours, and what they are a picture of.
+/// The contours with their edges told apart from their neighbours, as a plane rim.
 fn sharpened(
     views: [&ViewEdges<'_>; 2],
-    outer: [&Contour; 2],
-    inner: [Option<&Contour>; 2],
+    clicked: [&Contour; 2],
     p: [&Projection; 2],
     options: &Options,
 ) -> Result<Pair, Refusal> {
-    let contours = [views[0].sharpened(outer[0]), views[1].sharpened(outer[1])];
-    let inner = [inner[0].map(|c| views[0].sharpened(c)), inner[1].map(|c| views[1].sharpened(c))];
-    let all = [0, 1].map(|k| points(&contours[k], inner[k].as_ref()));
+    let contours = [views[0].sharpened(clicked[0]), views[1].sharpened(clicked[1])];
+    let all = [0, 1].map(|k| contours[k].edge_points(Outline::Outer));
     let run = |o: &Options| reconstruct(&all[0], p[0], &all[1], p[1], o);
     let mut reconstruction = run(options)?;
-    if reconstruction.model == RimModel::Ellipse && matches!(options.rim, RimChoice::Auto | RimChoice::Edge) {
+    if reconstruction.model == RimModel::Ellipse && options.rim == RimChoice::Edge {
         let rim = &reconstruction.rim;
         let largest = contours[0].ellipse.a.max(contours[1].ellipse.a);
         if (1.0 - rim.b / rim.a) * largest < ROUND_PX {
@@ -85,21 +70,14 @@ fn sharpened(
             }
         }
     }
-    // A bar without thickness is one outline taken for two.
-    if let Some(bar) = reconstruction.bar_radius.filter(|r| *r < THINNEST * reconstruction.rim.a) {
-        let r = &reconstruction.report;
-        let sigma_centre = r.sigma_centre.max(bar);
-        return Err(Refusal::BarUndetermined { sigma_centre, sigma_normal_deg: r.sigma_normal.to_degrees() });
-    }
     // Noise that hides a gap in sigmas does not make two contours one.
     let r = &reconstruction.report;
-    let gap = largest_gap(&reconstruction);
     let limit = options.gate_sigmas * options.calibration_px.max(0.25) + 1.0;
-    if gap > limit && reconstruction.bar_radius.is_none() {
+    if largest_gap(&reconstruction) > limit {
         let (gap_px, gap_sigma_px) = (r.gap_px, r.gap_sigma_px);
         return Err(Refusal::Mismatch { gap_px, gap_sigma_px, excess: r.excess, limit, delta: r.delta });
     }
-    Ok(Pair { contours, inner, reconstruction, tried: 0 })
+    Ok(Pair { contours, inner: [None, None], reconstruction, tried: 0 })
 }
 
 fn largest_gap(r: &Reconstruction) -> f64 {
@@ -119,6 +97,46 @@ fn misfit(pair: &Pair) -> f64 {
     20.0 * (sum / f64::max(count, 1.0)).sqrt() + 3.0 * largest_gap(&pair.reconstruction)
 }
 
+/// By how much the information criterion has to prefer one model before the other is forgotten.
+const DECISIVE: f64 = 20.0;
+
+/// Chi-squared per degree of freedom up to which a circle is clean.
+const CLEAN: f64 = 1.6;
+
+/// Normals closer than this do not need to be decided between, degrees.
+const SAME_DEG: f64 = 0.3;
+
+/// Part of the options' edge error that even the cleanest contour is taken to have.
+const SHARE_OF_BIAS: f64 = 0.5;
+
+/// Pairs at which a bar is looked for.
+const BAR_PAIRS: usize = 8;
+
+/// The bars whose outlines were clicked, with the evidence for each, and how well the best guess is supported.
+fn bars(
+    views: [&ViewEdges<'_>; 2],
+    clicked: [&Contour; 2],
+    p: [&Projection; 2],
+    options: &Options,
+    most: usize,
+) -> (Vec<(f64, BarFound)>, f64) {
+    // An outline's ellipse misses its tangents by less than a lenient gate, and its plane rim is a start for the bar.
+    let plane = Options { rim: RimChoice::Edge, calibration_px: options.calibration_px.max(2.0), ..*options };
+    let points = [0, 1].map(|k| clicked[k].edge_points(Outline::Outer));
+    let Ok(r) = reconstruct(&points[0], p[0], &points[1], p[1], &plane) else { return (Vec::new(), 0.0) };
+    let start = (r.rim.centre, r.rim.normal, (r.rim.a * r.rim.b).sqrt());
+    let search = barsearch::find(views, clicked, start, p, options, most);
+    let mut out: Vec<(f64, BarFound)> = search.found.into_iter().map(|b| (b.evidence(p, options), b)).collect();
+    out.sort_by(|a, b| b.0.total_cmp(&a.0));
+    (out, search.support)
+}
+
+impl From<BarFound> for Pair {
+    fn from(b: BarFound) -> Self {
+        Self { contours: b.outer, inner: b.inner.map(Some), reconstruction: b.reconstruction, tried: 0 }
+    }
+}
+
 /// Finds the likeliest pair that is the picture of one rim. `views` are where the candidates come from.
 pub fn pair(
     views: [&ViewEdges<'_>; 2],
@@ -126,71 +144,151 @@ pub fn pair(
     p: [&Projection; 2],
     options: &Options,
 ) -> Result<Pair, Unpaired> {
-    let strict = match options.rim {
-        RimChoice::RoundBar => Some(false),
-        RimChoice::Auto => Some(true),
-        _ => None,
-    };
-    let others: Vec<Vec<Option<OtherOutline>>> = views
-        .iter()
-        .zip(candidates)
-        .map(|(v, c)| c.iter().map(|c| strict.and_then(|s| other_outline(v, &c.contour, s))).collect())
-        .collect();
-    let (Some(other_left), Some(other_right)) = (others.first(), others.get(1)) else {
-        return Err(Unpaired {
-            refusal: Refusal::BadInput { what: "the selection", why: "no contour was found" },
-            swapped_fits: false,
-        });
-    };
+    let mut found = likeliest(views, candidates, p, options)?;
+    found.doubt(p, options).map_err(|refusal| Unpaired { refusal, swapped_fits: false })?;
+    Ok(found)
+}
+
+impl Pair {
+    /// Adds what edges have wrong together to the covariance, and holds the result against the tolerance once more.
+    fn doubt(&mut self, p: [&Projection; 2], options: &Options) -> Result<(), Refusal> {
+        let mut lists = Vec::new();
+        for (view, (outer, inner)) in self.contours.iter().zip(&self.inner).enumerate() {
+            lists.push((view, outer, outer.edge_points(Outline::Outer)));
+            lists.extend(inner.iter().map(|c| (view, c, c.edge_points(Outline::Inner))));
+        }
+        let stretches: Vec<Stretch<'_>> = lists
+            .iter()
+            .map(|(view, c, points)| Stretch {
+                view: *view,
+                points,
+                place: c.points.iter().map(|p| p.parameter).collect(),
+            })
+            .collect();
+        let r = &mut self.reconstruction;
+        if options.edge_bias_px > 0.0 {
+            widen(r, &stretches, p, SHARE_OF_BIAS * options.edge_bias_px);
+        }
+        tolerable(r.report.sigma_centre, r.report.sigma_normal, r.rim.a, r.report.vergence, r.model, options)
+    }
+}
+
+/// Whether the edges lie on a circle as closely as their noise lets them.
+fn is_clean_circle(r: &Reconstruction) -> bool {
+    r.model == RimModel::Circle && r.report.chi2 / r.report.dof.max(1) as f64 <= CLEAN
+}
+
+fn ambiguous() -> Result<Pair, Unpaired> {
+    Err(Unpaired { refusal: Refusal::RimAmbiguous, swapped_fits: false })
+}
+
+fn likeliest(
+    views: [&ViewEdges<'_>; 2],
+    candidates: [&[Candidate]; 2],
+    p: [&Projection; 2],
+    options: &Options,
+) -> Result<Pair, Unpaired> {
     let mut order = Vec::new();
-    for (l, ol) in candidates[0].iter().zip(other_left) {
-        for (r, or) in candidates[1].iter().zip(other_right) {
+    for l in candidates[0] {
+        for r in candidates[1] {
             let side = if l.contour.bright_inside == r.contour.bright_inside { 0.0 } else { OTHER_SIDE };
-            order.push((l.cost + r.cost + side, l, ol.as_ref(), r, or.as_ref()));
+            order.push((l.cost + r.cost + side, l, r));
         }
     }
     order.sort_by(|a, b| a.0.total_cmp(&b.0));
+    if options.rim == RimChoice::RoundBar {
+        return round_bar(views, &order, p, options);
+    }
+    let flat = Options { rim: if options.rim == RimChoice::Auto { RimChoice::Edge } else { options.rim }, ..*options };
     let mut first: Option<Refusal> = None;
-    let mut accepted: Vec<(f64, Pair)> = Vec::new();
-    for (tried, (cost, l, ol, r, or)) in order.iter().enumerate() {
+    let mut accepted: Vec<(f64, usize, Pair)> = Vec::new();
+    for (tried, (cost, l, r)) in order.iter().enumerate() {
         // What lies much further from the clicks was not meant, however well it fits.
         if accepted.len() >= COMPARED || accepted.first().is_some_and(|a| *cost > a.0 + 6.0) {
             break;
         }
-        // Both clicks must be on the same outline of the two.
-        let agree = matches!((ol, or), (Some(a), Some(b)) if a.inside == b.inside);
-        let (left, left_inner) = outlines(&l.contour, ol.filter(|_| agree));
-        let (right, right_inner) = outlines(&r.contour, or.filter(|_| agree));
-        match reconstruct(&points(left, left_inner), p[0], &points(right, right_inner), p[1], options) {
-            Ok(coarse) => {
-                let bar = coarse.bar_radius.is_some();
-                // A plane rim is what was clicked, whatever lies inside or round it.
-                let (pair, inner) = if bar {
-                    ([left, right], [left_inner, right_inner])
-                } else {
-                    ([&l.contour, &r.contour], [None, None])
-                };
-                match sharpened(views, pair, inner, p, options) {
-                    Ok(pair) => {
-                        let pair = Pair { tried, ..pair };
-                        accepted.push((cost + misfit(&pair), pair));
-                    }
-                    Err(e) => {
-                        first.get_or_insert(e);
+        let clicked = [&l.contour, &r.contour];
+        let coarse = clicked.map(|c| c.edge_points(Outline::Outer));
+        let pair =
+            reconstruct(&coarse[0], p[0], &coarse[1], p[1], &flat).and_then(|_| sharpened(views, clicked, p, &flat));
+        match pair {
+            Ok(pair) => accepted.push((cost + misfit(&pair), tried, Pair { tried, ..pair })),
+            Err(e) => {
+                first.get_or_insert(e);
+            }
+        }
+    }
+    let best = accepted.into_iter().min_by(|a, b| a.0.total_cmp(&b.0));
+    if options.rim == RimChoice::Auto {
+        let likely: Vec<usize> = match &best {
+            Some((_, tried, _)) => vec![*tried],
+            None => (0..order.len().min(BAR_PAIRS)).collect(),
+        };
+        for (_, l, r) in likely.iter().filter_map(|k| order.get(*k)) {
+            let clean = best.as_ref().is_some_and(|(_, _, b)| is_clean_circle(&b.reconstruction));
+            let most = if clean { 1 } else { barsearch::GUESSES };
+            let (found, support) = bars(views, [&l.contour, &r.contour], p, options, most);
+            // The best guess has to be the one that was followed and found wanting; that some other bar is not there says nothing.
+            let decided = found.iter().any(|(e, b)| e.abs() > DECISIVE && b.support > 0.9 * support);
+            if let Some((evidence, bar)) = found.into_iter().next() {
+                if evidence > DECISIVE {
+                    return Ok(bar.into());
+                }
+                if let Some((_, _, plane)) = &best {
+                    let apart = bar.reconstruction.rim.normal.angle(&plane.reconstruction.rim.normal).to_degrees();
+                    if evidence > -DECISIVE && apart > SAME_DEG {
+                        return ambiguous();
                     }
                 }
+            }
+            // A second outline that cannot be followed, and a first one that is no clean circle: nobody knows.
+            if best.is_some() && !decided && !clean && support > barsearch::SUPPORTED {
+                return ambiguous();
+            }
+        }
+    }
+    if let Some((_, _, best)) = best {
+        return Ok(best);
+    }
+    let swapped_fits = order.iter().take(4).any(|(_, l, r)| {
+        let (a, b) = (r.contour.edge_points(Outline::Outer), l.contour.edge_points(Outline::Outer));
+        reconstruct(&a, p[0], &b, p[1], options).is_ok()
+    });
+    let refusal = first.unwrap_or(Refusal::BadInput { what: "the selection", why: "no contour was found" });
+    Err(Unpaired { refusal, swapped_fits })
+}
+
+/// A round bar because the operator says so: both outlines if they can be found, the clicked one alone if that is enough.
+fn round_bar(
+    views: [&ViewEdges<'_>; 2],
+    order: &[(f64, &Candidate, &Candidate)],
+    p: [&Projection; 2],
+    options: &Options,
+) -> Result<Pair, Unpaired> {
+    let mut first: Option<Refusal> = None;
+    for (tried, (_, l, r)) in order.iter().take(BAR_PAIRS).enumerate() {
+        let clicked = [&l.contour, &r.contour];
+        let whole = |b: &BarFound| b.outer.iter().chain(&b.inner).map(|c| c.coverage).sum::<f64>();
+        let found = bars(views, clicked, p, options, barsearch::GUESSES).0.into_iter().map(|b| b.1);
+        if let Some(best) = found.max_by(|a, b| whole(a).total_cmp(&whole(b))) {
+            return Ok(Pair { tried, ..best.into() });
+        }
+        let contours = [views[0].sharpened(clicked[0]), views[1].sharpened(clicked[1])];
+        let points = [0, 1].map(|k| contours[k].edge_points(Outline::Outer));
+        match reconstruct(&points[0], p[0], &points[1], p[1], options) {
+            // A bar without thickness is one outline taken for two.
+            Ok(r) if r.bar_radius.is_some_and(|b| b >= THINNEST * r.rim.a) => {
+                return Ok(Pair { contours, inner: [None, None], reconstruction: r, tried });
+            }
+            Ok(r) => {
+                let (sigma_centre, sigma_normal_deg) = (r.report.sigma_centre, r.report.sigma_normal.to_degrees());
+                first.get_or_insert(Refusal::BarUndetermined { sigma_centre, sigma_normal_deg });
             }
             Err(e) => {
                 first.get_or_insert(e);
             }
         }
     }
-    if let Some((_, best)) = accepted.into_iter().min_by(|a, b| a.0.total_cmp(&b.0)) {
-        return Ok(best);
-    }
-    let swapped_fits = order.iter().take(4).any(|(_, l, _, r, _)| {
-        reconstruct(&points(&r.contour, None), p[0], &points(&l.contour, None), p[1], options).is_ok()
-    });
     let refusal = first.unwrap_or(Refusal::BadInput { what: "the selection", why: "no contour was found" });
-    Err(Unpaired { refusal, swapped_fits })
+    Err(Unpaired { refusal, swapped_fits: false })
 }

@@ -4,6 +4,7 @@ use super::contour::{Contour, ViewEdges};
 use super::grasp::{self, Approach, Grasp, GraspError, object_frame};
 use super::lens::projection;
 use super::model::{self, Projection, Reconstruction, RimModel};
+use super::order::{self, Votes};
 use super::pairing::{self, Pair};
 use super::picture::Picture;
 use super::propose::{Proposal, propose};
@@ -91,6 +92,16 @@ pub enum PlanError {
         /// Why they do not fit as given.
         as_given: Refusal,
     },
+    /// The pictures are exchanged, by everything that is in them.
+    #[error(
+        "the views are swapped: of the distinct spots of the pictures {exchanged} lie where the rig wants them with left and right exchanged, {as_given} as given: exchange the two pictures, or the cameras in the rig file"
+    )]
+    Exchanged {
+        /// Spots that speak for the order as given.
+        as_given: usize,
+        /// Spots that speak for the other.
+        exchanged: usize,
+    },
     /// No rim.
     #[error(transparent)]
     Rim(#[from] Refusal),
@@ -106,7 +117,7 @@ impl PlanError {
             Self::File(_) => "file",
             Self::PictureSize { .. } => "picture-size",
             Self::Select(_) => "selection",
-            Self::Swapped { .. } => "views-swapped",
+            Self::Swapped { .. } | Self::Exchanged { .. } => "views-swapped",
             Self::Rim(_) => "rim",
             Self::Grasp(_) => "grasp",
         }
@@ -118,15 +129,19 @@ impl PlanError {
     }
 }
 
-/// Where the pictures' contours come from.
-pub(super) struct Views<'a> {
+/// Two pictures with everything that a plan takes from them whatever is selected, so that several selections cost its making once.
+#[derive(Debug)]
+pub struct Prepared<'a> {
     pub(super) edges: [ViewEdges<'a>; 2],
     pub(super) p: [Projection; 2],
+    pictures: [&'a Picture; 2],
+    rig: &'a RigFile,
+    votes: std::cell::OnceCell<Votes>,
 }
 
-impl<'a> Views<'a> {
+impl<'a> Prepared<'a> {
     /// Checks the pictures' sizes and finds their edges.
-    pub(super) fn new(pictures: [&'a Picture; 2], rig: &RigFile) -> Result<Self, PlanError> {
+    pub fn new(pictures: [&'a Picture; 2], rig: &'a RigFile) -> Result<Self, PlanError> {
         for (view, picture, name) in [(View::Left, pictures[0], "left"), (View::Right, pictures[1], "right")] {
             let c = rig.rig.camera(view);
             if (picture.width(), picture.height()) != (c.width as usize, c.height as usize) {
@@ -140,7 +155,72 @@ impl<'a> Views<'a> {
             }
         }
         let edges = View::BOTH.map(|v| ViewEdges::new(pictures[v.index()], rig.rig.camera(v)));
-        Ok(Self { edges, p: View::BOTH.map(|v| projection(&rig.rig, v)) })
+        let p = View::BOTH.map(|v| projection(&rig.rig, v));
+        Ok(Self { edges, p, pictures, rig, votes: std::cell::OnceCell::new() })
+    }
+
+    /// How the pictures' spots vote on their order; taken once.
+    pub fn order(&self) -> Votes {
+        *self.votes.get_or_init(|| self.vote())
+    }
+
+    /// Lets them vote.
+    pub fn vote(&self) -> Votes {
+        let [l, r] = &self.edges;
+        let noise = l.map.noise().max(r.map.noise());
+        order::votes(self.pictures, [&l.lens, &r.lens], [&self.p[0], &self.p[1]], noise)
+    }
+
+    /// Refuses pictures in the wrong order.
+    fn in_order(&self) -> Result<(), PlanError> {
+        let v = self.order();
+        if v.are_exchanged() {
+            return Err(PlanError::Exchanged { as_given: v.as_given, exchanged: v.exchanged });
+        }
+        Ok(())
+    }
+
+    /// Plans a grasp on the contour that was selected in both pictures.
+    pub fn plan(
+        &self,
+        selections: [&Selection; 2],
+        gripper: &GripperFile,
+        options: &PlanOptions,
+    ) -> Result<Plan, PlanError> {
+        let [l, r] = &self.edges;
+        let left = select::contours(View::Left, l, selections[0], CANDIDATES);
+        let right = select::contours(View::Right, r, selections[1], CANDIDATES);
+        let (left, right) = match (left, right) {
+            (Ok(l), Ok(r)) => (l, r),
+            (Err(e), _) | (_, Err(e)) => {
+                self.in_order()?;
+                return Err(self
+                    .crossed(selections, options)
+                    .map_or(PlanError::Select(e), |as_given| PlanError::Swapped { as_given }));
+            }
+        };
+        let record = selections.map(|s| SelectionRecord {
+            kind: s.kind().to_owned(),
+            points_px: s.pixels().iter().map(|p| [p.x, p.y]).collect(),
+        });
+        from_candidates(self, [&left, &right], record, gripper, options).map_err(|e| match e {
+            PlanError::Rim(rim) => self
+                .crossed(selections, options)
+                .map_or(PlanError::Rim(rim), |as_given| PlanError::Swapped { as_given }),
+            other => other,
+        })
+    }
+
+    /// Why the contours do not fit as given, where pictures too plain to tell their order do fit with selections and cameras exchanged.
+    fn crossed(&self, selections: [&Selection; 2], options: &PlanOptions) -> Option<Refusal> {
+        if self.order().are_as_given() {
+            return None;
+        }
+        let [l, r] = &self.edges;
+        let left = select::contours(View::Left, l, selections[1], 2).ok()?;
+        let right = select::contours(View::Right, r, selections[0], 2).ok()?;
+        let p = [&self.p[0], &self.p[1]];
+        pairing::pair([l, r], [&left, &right], p, &options.rim).err().filter(|u| u.swapped_fits).map(|u| u.refusal)
     }
 }
 
@@ -152,34 +232,7 @@ pub fn plan(
     gripper: &GripperFile,
     options: &PlanOptions,
 ) -> Result<Plan, PlanError> {
-    let views = Views::new(pictures, rig)?;
-    let [l, r] = &views.edges;
-    let left = select::contours(View::Left, l, selections[0], CANDIDATES);
-    let right = select::contours(View::Right, r, selections[1], CANDIDATES);
-    // Pictures given in the wrong order: each selection then belongs to the other picture.
-    let crossed = || -> Option<Refusal> {
-        let left = select::contours(View::Left, l, selections[1], 2).ok()?;
-        let right = select::contours(View::Right, r, selections[0], 2).ok()?;
-        let p = [&views.p[0], &views.p[1]];
-        pairing::pair([l, r], [&left, &right], p, &options.rim).err().filter(|u| u.swapped_fits).map(|u| u.refusal)
-    };
-    let (left, right) = match (left, right) {
-        (Ok(l), Ok(r)) => (l, r),
-        (Err(e), _) | (_, Err(e)) => {
-            return Err(crossed().map_or(PlanError::Select(e), |as_given| PlanError::Swapped { as_given }));
-        }
-    };
-    let record = selections.map(|s| SelectionRecord {
-        kind: s.kind().to_owned(),
-        points_px: s.pixels().iter().map(|p| [p.x, p.y]).collect(),
-    });
-    from_candidates(&views, [&left, &right], record, pictures, rig, gripper, options).map_err(|e| match e {
-        PlanError::Rim(as_given) => match crossed() {
-            Some(as_given) => PlanError::Swapped { as_given },
-            None => PlanError::Rim(as_given),
-        },
-        other => other,
-    })
+    Prepared::new(pictures, rig)?.plan(selections, gripper, options)
 }
 
 /// Ellipses proposed without a selection, ranked, at most `most`.
@@ -189,7 +242,8 @@ pub fn proposals(
     options: &PlanOptions,
     most: usize,
 ) -> Result<Vec<Proposal>, PlanError> {
-    let views = Views::new(pictures, rig)?;
+    let views = Prepared::new(pictures, rig)?;
+    views.in_order()?;
     Ok(propose(&views.edges, [&views.p[0], &views.p[1]], &options.rim, most))
 }
 
@@ -201,28 +255,33 @@ pub fn plan_proposal(
     gripper: &GripperFile,
     options: &PlanOptions,
 ) -> Result<Plan, PlanError> {
-    let views = Views::new(pictures, rig)?;
+    let views = Prepared::new(pictures, rig)?;
     let [left, right] = proposal.candidates();
     let record = [0, 1].map(|k| SelectionRecord {
         kind: "auto".to_owned(),
         points_px: proposal.contours[k].points.first().map(|p| [p.raw.x, p.raw.y]).into_iter().collect(),
     });
-    from_candidates(&views, [&left, &right], record, pictures, rig, gripper, options)
+    from_candidates(&views, [&left, &right], record, gripper, options)
 }
 
 /// The rest of the stage, from each view's candidate contours.
 pub(super) fn from_candidates(
-    views: &Views<'_>,
+    views: &Prepared<'_>,
     candidates: [&[Candidate]; 2],
     selection: [SelectionRecord; 2],
-    pictures: [&Picture; 2],
-    rig: &RigFile,
     gripper: &GripperFile,
     options: &PlanOptions,
 ) -> Result<Plan, PlanError> {
+    // A rim near the middle can be reconstructed either way round; the rest of the pictures tells.
+    views.in_order()?;
+    let (pictures, rig) = (views.pictures, views.rig);
     let p = [&views.p[0], &views.p[1]];
     let found = pairing::pair([&views.edges[0], &views.edges[1]], candidates, p, &options.rim).map_err(|u| {
-        if u.swapped_fits { PlanError::Swapped { as_given: u.refusal } } else { PlanError::Rim(u.refusal) }
+        if u.swapped_fits && !views.order().are_as_given() {
+            PlanError::Swapped { as_given: u.refusal }
+        } else {
+            PlanError::Rim(u.refusal)
+        }
     })?;
     let Pair { contours, inner, reconstruction, .. } = found;
     let grasp = grasp::choose(&rig.rig, gripper, &reconstruction, &options.approach)?;

@@ -134,6 +134,11 @@ pub enum Refusal {
         /// Predicted standard deviation of the normal, degrees.
         sigma_normal_deg: f64,
     },
+    /// A sharp edge and a round bar explain the outlines equally well.
+    #[error(
+        "the contour may be a sharp edge or an outline of a round bar, which would lie degrees apart: say which it is, --rim edge or --rim round-bar (with --bar-diameter if it is known)"
+    )]
+    RimAmbiguous,
     /// The result is less certain than asked for.
     #[error(
         "too uncertain: centre {sigma_centre:.4} (limit {limit_centre:.4}), normal {sigma_normal_deg:.2} degrees (limit {limit_normal_deg:.2}), vergence {vergence_deg:.1} degrees: {advice}"

@@ -98,7 +98,7 @@ impl Torus {
             let step = if bend > 1e-3 * self.core * self.core { -slope / bend } else { -0.1 * slope.signum() };
             let step = step.clamp(-0.3, 0.3);
             u += step;
-            if step.abs() < 1e-13 {
+            if step.abs() < 1e-10 {
                 break;
             }
         }

@@ -1,10 +1,10 @@
 //! The off-line stage on the simulator's pictures: from one click a view to the rim, against the truth.
 //!
-//! `GRASPD_WORLDS=200` runs more of each kind and prints the 95 % figures.
+//! `GRASPD_WORLDS=100` runs more of each kind and prints the 95 % figures (`plan_worlds` and `judge_worlds` do the same from pictures on disk).
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::RigFile;
-use graspd_calib::offline::model::RimChoice;
+use graspd_calib::offline::model::{RimChoice, RimModel};
 use graspd_calib::offline::picture::Picture;
 use graspd_calib::offline::plan::{Plan, PlanError, PlanOptions, plan};
 use graspd_calib::offline::select::Selection;
@@ -91,7 +91,7 @@ fn the_demo_worlds_are_planned_from_their_own_clicks() {
     let (c, n) = (percentile(&mut c, 0.95), percentile(&mut n, 0.95));
     eprintln!("demo worlds, 95 %: centre {c:.3} mm, normal {n:.3} degrees");
     // What is left is the edge of the paint next to the bar's own limb, less than a pixel away where the rim turns from the camera.
-    assert!(c <= 0.8 && n <= 0.5, "{c} {n}");
+    assert!(c <= 0.3 && n <= 0.3, "{c} {n}");
 }
 
 #[test]
@@ -99,16 +99,17 @@ fn a_painted_rim_with_a_third_hidden_is_found() {
     let (mut c, mut n, mut r) = (Vec::new(), Vec::new(), Vec::new());
     let total = worlds(2);
     let options = Options {
-        core_radius_m: [0.075, 0.075],
-        bar_radius_m: [0.008, 0.010],
+        // The painted circle's outer edge has a radius of 75 mm.
+        core_radius_m: [0.0715, 0.0715],
         rim_occlusion: 0.3,
+        tilt_deg: [5.0, 40.0],
         with_arm: false,
         ..Options::default()
     };
     for seed in 1..=total {
         let s = Scenario::from_seed(seed, &options).unwrap();
         let shot = Snapshot { object_from_gripper: [None; 2], opening: 0.1, frame: 0, hidden_marks: 0 };
-        let Ok(p) = run(&s, &shot, s.clicks, RimChoice::Edge) else { continue };
+        let Ok(p) = run(&s, &shot, s.clicks, RimChoice::Auto) else { continue };
         let (a, b) = errors(&s, &p, 0.0);
         let q = p.reconstruction.rim.b / p.reconstruction.rim.a;
         eprintln!(
@@ -122,7 +123,7 @@ fn a_painted_rim_with_a_third_hidden_is_found() {
     assert_eq!(c.len() as u64, total);
     let (c, n, r) = (percentile(&mut c, 0.95), percentile(&mut n, 0.95), percentile(&mut r, 0.05));
     eprintln!("painted rim, 95 %: centre {c:.3} mm, normal {n:.3} degrees, axis ratio {r:.4}");
-    assert!(c <= 0.5 && n <= 0.5 && r >= 0.995, "{c} {n} {r}");
+    assert!(c <= 0.3 && n <= 0.15 && r >= 0.995, "{c} {n} {r}");
 }
 
 #[test]
@@ -148,7 +149,8 @@ fn a_bare_torus_is_a_round_bar_and_a_plane_edge_is_wrong_about_it() {
             let at = truth.translation.vector + side * s.stage.wheel.outer_radius();
             s.true_rig.project(v, &at).unwrap()
         });
-        let Ok(p) = run(&s, &shot, clicks, RimChoice::RoundBar) else { continue };
+        let Ok(p) = run(&s, &shot, clicks, RimChoice::Auto) else { continue };
+        assert_eq!(p.reconstruction.model, RimModel::RoundBar, "seed {seed}: a bar was planned as a plane edge");
         let (a, b) = errors(&s, &p, 0.0);
         let w = &s.stage.wheel;
         eprintln!(
@@ -163,13 +165,14 @@ fn a_bare_torus_is_a_round_bar_and_a_plane_edge_is_wrong_about_it() {
         );
         c.push(a);
         n.push(b);
-        if let Ok(q) = run(&s, &shot, clicks, RimChoice::Ellipse) {
+        if let Ok(q) = run(&s, &shot, clicks, RimChoice::Edge) {
             let e = errors(&s, &q, 0.0);
             eprintln!("         as a plane edge: centre {:.2} mm, normal {:.2} degrees", e.0, e.1);
             flat.push(e.1);
         }
     }
-    assert_eq!(c.len() as u64, total);
+    // A refusal is honest, but the exception.
+    assert!(c.len() as u64 * 10 >= total * 9, "{} of {total} planned", c.len());
     let (c, n) = (percentile(&mut c, 0.95), percentile(&mut n, 0.95));
     eprintln!("torus, 95 %: centre {c:.3} mm, normal {n:.3} degrees");
     assert!(c <= 0.4 && n <= 0.25, "{c} {n}");

@@ -3,6 +3,7 @@
 //! [`Scenario::from_seed`] draws a valve, a rig and a start pose at random; [`Scenario::save`] and [`Scenario::load`] keep a cell as
 //! a *world*: a folder with the files an integrator would have (`rig.toml`, `gripper.toml`) and, apart from them, the truth.
 
+mod circles;
 mod draw;
 mod gripper;
 mod options;
@@ -10,6 +11,7 @@ mod reach;
 mod truth;
 mod world;
 
+pub use circles::Circle;
 pub use draw::ScenarioError;
 pub use gripper::default_gripper;
 pub use options::Options;

@@ -68,7 +68,8 @@ impl Wheel {
         0.55 * self.bar_radius_m
     }
 
-    fn hub_radius(&self) -> f64 {
+    /// Radius of the hub, metres.
+    pub fn hub_radius(&self) -> f64 {
         (0.24 * self.core_radius_m).max(1.4 * self.bar_radius_m)
     }
 
