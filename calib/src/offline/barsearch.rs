@@ -35,7 +35,7 @@ pub(super) struct Search {
 }
 
 /// Support from which the other outline of a bar seems to be there (1.5 where it is seen whole in both views).
-pub(super) const SUPPORTED: f64 = 1.0;
+pub(super) const SUPPORTED: f64 = 0.7;
 
 /// Thinnest and thickest picture of a bar, in parts of the outline's semi-major axis.
 const WIDTH: [f64; 2] = [0.05, 0.65];
@@ -47,8 +47,8 @@ const STEP: f64 = 2.0;
 const TESTED: usize = 72;
 /// Least part of an outline that has to carry edges for a guess to be followed up.
 const FOLLOWED: f64 = 0.3;
-/// How far from parallel the planes of a flat ring's two edges may seem, radians (0.3 degrees).
-const PARALLEL_RAD: f64 = 0.005;
+/// How far from parallel the planes of a flat ring's two edges may seem, radians (0.15 degrees).
+const PARALLEL_RAD: f64 = 0.0026;
 /// Thicknesses at which the pose is fitted.
 const KNOTS: usize = 5;
 /// Most that an outline may leave the bar, pixels (root mean square): more, and it is something else that was followed.
