@@ -30,11 +30,14 @@ pub(super) struct BarFound {
 pub(super) struct Search {
     /// Bars whose four outlines are there.
     pub(super) found: Vec<BarFound>,
-    /// Support of the best guess, followed or not: above [`SUPPORTED`] a bar is not out of the question.
+    /// Support of the best guess, followed or not (1.5 where the other outline is seen whole in both views).
     pub(super) support: f64,
+    /// By how much a guess, followed or not, is better supported than most thicknesses are: above [`SUPPORTED`] a bar is not out of the question.
+    pub(super) excess: f64,
 }
 
-/// Support from which the other outline of a bar seems to be there (1.5 where it is seen whole in both views).
+/// Excess of support from which the other outline of a bar seems to be there. Among much else in a picture any thickness has some support: a wheel's
+/// flanges, tyre and brake give 0.7 of it on the median, and 1.3 at the flange; a bar's other outline stands out by more than one.
 pub(super) const SUPPORTED: f64 = 0.7;
 
 /// Thinnest and thickest picture of a bar, in parts of the outline's semi-major axis.
@@ -116,6 +119,8 @@ struct Guess {
     /// Whether the clicked outline is the outer one.
     clicked_outer: bool,
     worth: f64,
+    /// By how much it is worth more than the median thickness.
+    excess: f64,
 }
 
 /// Looks for the bar whose outline was clicked. `plane` is what the contours are a picture of if they are a plane rim; with the bar's diameter known only that is tried.
@@ -127,12 +132,12 @@ pub(super) fn find(
     options: &Options,
     most: usize,
 ) -> Search {
-    let none = Search { found: Vec::new(), support: 0.0 };
-    let Some(eyes) = camera_centre(p[0]).zip(camera_centre(p[1])) else { return none };
+    let mut search = Search { found: Vec::new(), support: 0.0, excess: 0.0 };
+    let Some(eyes) = camera_centre(p[0]).zip(camera_centre(p[1])) else { return search };
     let views = [View { edges: views[0], p: p[0], eye: eyes.0 }, View { edges: views[1], p: p[1], eye: eyes.1 }];
-    let mut search = Search { found: Vec::new(), support: 0.0 };
     for g in guesses(&views, clicked, plane, options).into_iter().take(most) {
         search.support = search.support.max(g.worth);
+        search.excess = search.excess.max(g.excess);
         let Some(bar) = settle(&views, &g, options) else { continue };
         // Two guesses often lead to one bar.
         let same = |b: &BarFound| {
@@ -197,8 +202,10 @@ fn guesses(
         for w in &widths {
             let Some(t) = between(&knots, *w, 0.5 * w * pixel) else { continue };
             let (least, sum) = support(views, &t, clicked_outer, 2.0);
-            row.push(Guess { torus: t, clicked_outer, worth: least + 0.25 * sum });
+            row.push(Guess { torus: t, clicked_outer, worth: least + 0.25 * sum, excess: 0.0 });
         }
+        let usual = super::robust::median(row.iter().map(|g| g.worth).collect());
+        row.iter_mut().for_each(|g| g.excess = g.worth - usual);
         for k in 0..row.len() {
             let w = |k: Option<usize>| k.and_then(|k| row.get(k)).map_or(0.0, |g| g.worth);
             if let Some(g) = row

@@ -112,23 +112,23 @@ const SHARE_OF_BIAS: f64 = 0.5;
 /// Pairs at which a bar is looked for.
 const BAR_PAIRS: usize = 8;
 
-/// The bars whose outlines were clicked, with the evidence for each, and how well the best guess is supported.
+/// The bars whose outlines were clicked, with the evidence for each, and how well the best guess is supported: in all, and beyond what is usual.
 fn bars(
     views: [&ViewEdges<'_>; 2],
     clicked: [&Contour; 2],
     p: [&Projection; 2],
     options: &Options,
     most: usize,
-) -> (Vec<(f64, BarFound)>, f64) {
+) -> (Vec<(f64, BarFound)>, f64, f64) {
     // An outline's ellipse misses its tangents by less than a lenient gate, and its plane rim is a start for the bar.
     let plane = Options { rim: RimChoice::Edge, calibration_px: options.calibration_px.max(2.0), ..*options };
     let points = [0, 1].map(|k| clicked[k].edge_points(Outline::Outer));
-    let Ok(r) = reconstruct(&points[0], p[0], &points[1], p[1], &plane) else { return (Vec::new(), 0.0) };
+    let Ok(r) = reconstruct(&points[0], p[0], &points[1], p[1], &plane) else { return (Vec::new(), 0.0, 0.0) };
     let start = (r.rim.centre, r.rim.normal, (r.rim.a * r.rim.b).sqrt());
     let search = barsearch::find(views, clicked, start, p, options, most);
     let mut out: Vec<(f64, BarFound)> = search.found.into_iter().map(|b| (b.evidence(p, options), b)).collect();
     out.sort_by(|a, b| b.0.total_cmp(&a.0));
-    (out, search.support)
+    (out, search.support, search.excess)
 }
 
 impl From<BarFound> for Pair {
@@ -227,7 +227,7 @@ fn likeliest(
         for (_, l, r) in likely.iter().filter_map(|k| order.get(*k)) {
             let clean = best.as_ref().is_some_and(|(_, _, b)| is_clean_circle(&b.reconstruction));
             let most = if clean { 1 } else { barsearch::GUESSES };
-            let (found, support) = bars(views, [&l.contour, &r.contour], p, options, most);
+            let (found, support, excess) = bars(views, [&l.contour, &r.contour], p, options, most);
             // The best guess has to be the one that was followed and found wanting; that some other bar is not there says nothing.
             let decided = found.iter().any(|(e, b)| e.abs() > DECISIVE && b.support > 0.9 * support);
             if let Some((evidence, bar)) = found.into_iter().next() {
@@ -242,7 +242,7 @@ fn likeliest(
                 }
             }
             // A second outline that cannot be followed, and a first one that is no clean circle: nobody knows.
-            if best.is_some() && !decided && !clean && support > barsearch::SUPPORTED {
+            if best.is_some() && !decided && !clean && excess > barsearch::SUPPORTED {
                 return ambiguous();
             }
         }

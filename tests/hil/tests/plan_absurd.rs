@@ -58,7 +58,7 @@ fn is_there(p: &Plan, circles: &[Circle]) -> bool {
 /// One selection of a kind in a cell, as given to the pictures in that order.
 fn selections(kind: usize, c: &Cell, r: &mut ChaCha8Rng) -> [Selection; 2] {
     let (w, h) = (f64::from(c.scenario.true_rig.left.width), f64::from(c.scenario.true_rig.left.height));
-    let mut anywhere = |r: &mut ChaCha8Rng| Pixel::new(r.random_range(0.0..w - 1.0), r.random_range(0.0..h - 1.0));
+    let anywhere = |r: &mut ChaCha8Rng| Pixel::new(r.random_range(0.0..w - 1.0), r.random_range(0.0..h - 1.0));
     let rim = c.scenario.clicks;
     match kind {
         0 => [anywhere(r), anywhere(r)].map(Selection::Click),
