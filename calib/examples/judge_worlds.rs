@@ -77,7 +77,7 @@ fn main() {
                 let e = errors(&p, &truth["circles"][0]);
                 let r = &p.reconstruction;
                 println!(
-                    "{name:<10} {:9} centre {:.3} mm, normal {:.3} deg; sigma {:.3} {:.3}; distance {:.1} {:.1}; a {:.2} b {:.2} r {:.2} (bar {:.1} {:.1}) chi2 {:.2} {:.0} ms",
+                    "{name:<10} {:9} centre {:.3} mm, normal {:.3} deg; sigma {:.3} {:.3}; distance {:.1} {:.1}; a {:.2} b {:.2} r {:.2} (bar {:.1} {:.1}) chi2 {:.2} gap {:.2?} px {:.0} ms",
                     p.file.object.model,
                     e[0],
                     e[1],
@@ -91,6 +91,7 @@ fn main() {
                     bar[0] * 1e3,
                     bar[1] * 1e3,
                     p.file.object.chi2_per_dof,
+                    r.report.gap_px,
                     before.elapsed().as_secs_f64() * 1e3,
                 );
                 if r.model == RimModel::RoundBar {

@@ -42,6 +42,9 @@ const OTHER_SIDE: f64 = 12.0;
 /// a pixel, all round alike or in step with the tilt, which no count of points averages out.
 const ROUND_PX: f64 = 1.0;
 
+/// How far apart the tangents of an ellipse's two contours may be, in units of the rig's own doubt.
+const ELLIPSE_GAP: f64 = 1.5;
+
 /// Thinnest bar in parts of its ring's radius.
 const THINNEST: f64 = 0.015;
 
@@ -70,9 +73,14 @@ fn sharpened(
             }
         }
     }
-    // Noise that hides a gap in sigmas does not make two contours one.
+    // Noise that hides a gap in sigmas does not make two contours one. That two ellipses are a circle speaks for itself; that they are some ellipse
+    // is all but always so, and only the tangents tell whether they belong together.
     let r = &reconstruction.report;
-    let limit = options.gate_sigmas * options.calibration_px.max(0.25) + 1.0;
+    let doubt = options.calibration_px.max(0.25);
+    let limit = match reconstruction.model {
+        RimModel::Ellipse => ELLIPSE_GAP * doubt,
+        _ => options.gate_sigmas * doubt + 1.0,
+    };
     if largest_gap(&reconstruction) > limit {
         let (gap_px, gap_sigma_px) = (r.gap_px, r.gap_sigma_px);
         return Err(Refusal::Mismatch { gap_px, gap_sigma_px, excess: r.excess, limit, delta: r.delta });

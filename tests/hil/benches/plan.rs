@@ -92,7 +92,7 @@ fn main() {
             Ok(p) => {
                 println!("  ({}, {:?} spots for the order of the pictures)", p.file.object.model, prepared.order());
                 time("  picture of the plan (not part of it)", || {
-                    black_box(overlay::draw(&p, pair, &rig, &gripper).ok());
+                    black_box(overlay::draw(&p, pair, &rig, &gripper));
                 });
             }
             Err(e) => println!("  refused: {e}"),

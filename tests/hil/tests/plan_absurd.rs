@@ -124,12 +124,15 @@ fn absurd_selections_give_no_wrong_answer() {
                     let r = &p.reconstruction;
                     let at: Vec<_> = s.iter().flat_map(|s| s.pixels()).map(|p| (p.x.round(), p.y.round())).collect();
                     eprintln!(
-                        "seed {seed}, {}: {:?} {at:?}, centre {:.4?}, a {:.1} mm, gap {:.2?} px",
+                        "seed {seed}, {}: {:?} {at:?}, centre {:.4?}, a {:.1} b {:.1} mm, gap {:.2?} px, chi2 {:.2}, turned {:.1} deg",
                         KINDS[kind],
                         r.model,
                         r.rim.centre.as_slice(),
                         r.rim.a * 1e3,
-                        r.report.gap_px
+                        r.rim.b * 1e3,
+                        r.report.gap_px,
+                        p.file.object.chi2_per_dof,
+                        r.rim.normal.angle(&Vec3::from(c.circles[0].normal)).to_degrees()
                     );
                 }
                 Err(e) => assert!(!matches!(e, PlanError::File(_)), "a plan that cannot be read back: {e}"),
