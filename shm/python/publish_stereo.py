@@ -69,6 +69,15 @@ def picture(width: int, height: int, k: int, eye: int) -> bytes:
     return b"".join(row[y : y + width] for y in range(height))
 
 
+def raw(path, n):
+    """A picture from a file of exactly n bytes."""
+    with open(path, "rb") as f:
+        data = f.read()
+    if len(data) != n:
+        sys.exit(f"{path}: {len(data)} bytes, {n} expected: width x height of mono8")
+    return data
+
+
 def main() -> int:
     a = argparse.ArgumentParser(description=__doc__)
     a.add_argument("--root", default=default_root(), help="shm root path, as in graspd.toml")
@@ -79,6 +88,8 @@ def main() -> int:
     a.add_argument("--rate", type=float, default=60.0, help="pairs per second")
     a.add_argument("--count", type=int, default=0, help="stop after so many pairs; 0 never")
     a.add_argument("--drop-every", type=int, default=0, help="lose every n-th pair on purpose")
+    a.add_argument("--left-raw", help="publish this file of width x height bytes instead of a test picture")
+    a.add_argument("--right-raw", help="the same for the right eye")
     a.add_argument("--serial-left", default="left")
     a.add_argument("--serial-right", default="right")
     o = a.parse_args()
@@ -116,7 +127,10 @@ def main() -> int:
         .allocation_strategy(iox2.AllocationStrategy.Static)
         .create()
     )
-    pictures = [[picture(o.width, o.height, k, eye) for eye in (0, 1)] for k in range(8)]
+    if o.left_raw and o.right_raw:
+        pictures = [[raw(o.left_raw, n), raw(o.right_raw, n)]] * 8
+    else:
+        pictures = [[picture(o.width, o.height, k, eye) for eye in (0, 1)] for k in range(8)]
     period = 1e9 / o.rate
     start = time.monotonic_ns()
     print('{"ready":true}', flush=True)
