@@ -1,14 +1,14 @@
 //! Time of the off-line stage's mathematics: `cargo bench -p graspd-calib --bench offline`. Prints; never judges.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
-use graspd_calib::offline::circle::extract;
-use graspd_calib::offline::cone::{ConePair, project};
 use graspd_calib::offline::conic::{fit_direct, fit_ml};
-use graspd_calib::offline::model::{EdgePoint, Options, RimChoice, Scatter};
-use graspd_calib::offline::planar::analyse;
-use graspd_calib::offline::plane::polar;
-use graspd_calib::offline::reconstruct::reconstruct;
-use graspd_calib::offline::synthetic::{Random, rig, rim_point, rim_tilted};
+use graspd_calib::offline::rim::circle::extract;
+use graspd_calib::offline::rim::cone::{ConePair, project};
+use graspd_calib::offline::rim::model::{EdgePoint, Options, RimChoice, Scatter};
+use graspd_calib::offline::rim::planar::analyse;
+use graspd_calib::offline::rim::plane::polar;
+use graspd_calib::offline::rim::reconstruct::reconstruct;
+use graspd_calib::offline::rim::synthetic::{Random, rig, rim_point, rim_tilted};
 use nalgebra::Vector3;
 use std::hint::black_box;
 use std::time::Instant;

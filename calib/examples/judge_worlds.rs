@@ -3,10 +3,10 @@
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::{GripperFile, RigFile};
-use graspd_calib::offline::model::{RimChoice, RimModel};
-use graspd_calib::offline::picture::Picture;
+use graspd_calib::offline::contour::select::Selection;
+use graspd_calib::offline::edges::picture::Picture;
 use graspd_calib::offline::plan::{Plan, PlanOptions, plan};
-use graspd_calib::offline::select::Selection;
+use graspd_calib::offline::rim::model::{RimChoice, RimModel};
 use graspd_rt::geom::{Pixel, Vec3};
 use std::path::Path;
 
@@ -25,7 +25,7 @@ fn errors(p: &Plan, rim: &serde_json::Value) -> [f64; 4] {
     let (c, n) = (Vec3::from_vec(numbers(&rim["centre"])), Vec3::from_vec(numbers(&rim["normal"])));
     let r = &p.reconstruction;
     let d = r.rim.centre - c;
-    let f = graspd_calib::offline::circle::frame_of(&r.rim.normal);
+    let f = graspd_calib::offline::rim::circle::frame_of(&r.rim.normal);
     let t = nalgebra::Vector2::new(n.dot(&f.column(0)), n.dot(&f.column(1)));
     let m_c = r.cov_centre.try_inverse().map_or(f64::NAN, |i| d.dot(&(i * d)));
     let m_n = r.cov_normal.try_inverse().map_or(f64::NAN, |i| t.dot(&(i * t)));

@@ -3,16 +3,16 @@
 //! Of a case only `id`, `image_size`, `P_left`, `P_right`, `points_left`, `points_right` and `sigma_px` are read, and the file's
 //! `gripper`. A case that cannot be read or reconstructed gets `"status": "error"` with the reason and spoils no other.
 
-use crate::offline::circle::{ClosedForm, vergence};
-use crate::offline::cone::project;
+use crate::offline::conic::sampson::distance;
 use crate::offline::conic::{ellipse_of, fit_direct, fit_ml};
+use crate::offline::handle::visibility::{Eye, FlatMark};
 use crate::offline::handle::{grasp_circle, grasp_ellipse};
-use crate::offline::ml::MlFit;
-use crate::offline::model::{EdgePoint, Ellipse2, Noise, Options, Projection, Rim, RimChoice, Scatter};
-use crate::offline::planar::{Analysis, analyse};
-use crate::offline::reconstruct::choose_plane_model;
-use crate::offline::sampson::distance;
-use crate::offline::visibility::{Eye, FlatMark};
+use crate::offline::rim::circle::{ClosedForm, vergence};
+use crate::offline::rim::cone::project;
+use crate::offline::rim::ml::MlFit;
+use crate::offline::rim::model::{EdgePoint, Ellipse2, Noise, Options, Projection, Rim, RimChoice, Scatter};
+use crate::offline::rim::planar::{Analysis, analyse};
+use crate::offline::rim::reconstruct::choose_plane_model;
 use nalgebra::{Isometry3, Matrix2, Matrix3, Point3, Vector2, Vector3};
 use serde_json::{Map, Value, json};
 

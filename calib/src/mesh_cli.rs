@@ -4,7 +4,7 @@ use crate::files::{
     ContentHash, FileError, GripperFile, MeshRecord, Pick, PickRecord, PicksFile, PictureRecord, PoseFile, PoseRecord,
     RigFile, ViewPair,
 };
-use crate::offline::picture::Picture;
+use crate::offline::edges::picture::Picture;
 use crate::offline::polyhedral::filter::Judged;
 use crate::offline::polyhedral::overlay;
 use crate::offline::polyhedral::plan::{MeshOptions, MeshPlan, MeshPlanError, Placed, Survey, survey};

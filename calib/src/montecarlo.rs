@@ -3,13 +3,13 @@
 //! The cells are those of the accuracy study, with cells for gross outliers and occlusion added. Every trial places a rim at random, adds
 //! noise, reconstructs, and compares with the truth; bounds are computed at the truth from noise-free points.
 
-use crate::offline::circle::frame_of;
-use crate::offline::cone::{camera_centre, project};
-use crate::offline::ml::TwoViews;
-use crate::offline::model::{EdgePoint, Options, Projection, Reconstruction, Rim, RimChoice, RimModel, Scatter};
-use crate::offline::reconstruct::reconstruct;
-use crate::offline::sampson::Cloud;
-use crate::offline::synthetic::{Random, rig, rim_of, rim_point};
+use crate::offline::conic::sampson::Cloud;
+use crate::offline::rim::circle::frame_of;
+use crate::offline::rim::cone::{camera_centre, project};
+use crate::offline::rim::ml::TwoViews;
+use crate::offline::rim::model::{EdgePoint, Options, Projection, Reconstruction, Rim, RimChoice, RimModel, Scatter};
+use crate::offline::rim::reconstruct::reconstruct;
+use crate::offline::rim::synthetic::{Random, rig, rim_of, rim_point};
 use nalgebra::{SMatrix, SVector, Vector2, Vector3};
 use std::f64::consts::TAU;
 use std::fmt::Write as _;

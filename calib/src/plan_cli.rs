@@ -1,14 +1,14 @@
 //! `graspd plan` without the command line: paths and options in, files and figures out, every failure in words.
 
 use crate::files::{ContentHash, FileError, GripperFile, RigFile};
-use crate::offline::grasp::Approach;
-use crate::offline::model::RimChoice;
-use crate::offline::overlay;
-use crate::offline::picture::Picture;
+use crate::offline::contour::select::Selection;
+use crate::offline::drawing::overlay;
+use crate::offline::drawing::report;
+use crate::offline::edges::picture::Picture;
+use crate::offline::handle::grasp::Approach;
+use crate::offline::pairs::propose::Proposal;
 use crate::offline::plan::{Plan, PlanError, PlanOptions, model_name, plan, plan_proposal, proposals};
-use crate::offline::propose::Proposal;
-use crate::offline::report;
-use crate::offline::select::Selection;
+use crate::offline::rim::model::RimChoice;
 use graspd_rt::geom::{Pixel, Pose};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};

@@ -1,10 +1,10 @@
 //! Wrong and absurd selections: none gives a wrong answer that passes more often than 1 in 1,000, none panics; and right ones pass.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
-use graspd_calib::offline::cone::project;
-use graspd_calib::offline::model::{EdgePoint, Options, Projection, Rim, RimChoice};
-use graspd_calib::offline::reconstruct::reconstruct;
-use graspd_calib::offline::synthetic::{Random, rig, rim_point, rim_tilted};
+use graspd_calib::offline::rim::cone::project;
+use graspd_calib::offline::rim::model::{EdgePoint, Options, Projection, Rim, RimChoice};
+use graspd_calib::offline::rim::reconstruct::reconstruct;
+use graspd_calib::offline::rim::synthetic::{Random, rig, rim_point, rim_tilted};
 use nalgebra::Vector3;
 use std::f64::consts::TAU;
 
@@ -28,7 +28,7 @@ fn seen(p: &Projection, rim: &Rim, n: usize, part: f64, r: &mut Random) -> Vec<E
 }
 
 /// Whether an answer is right to within the task's needs: five of its own standard deviations.
-fn right(rim: &Rim, got: &graspd_calib::offline::model::Reconstruction) -> bool {
+fn right(rim: &Rim, got: &graspd_calib::offline::rim::model::Reconstruction) -> bool {
     (got.rim.centre - rim.centre).norm() < 5.0 * got.report.sigma_centre
         && got.rim.normal.cross(&rim.normal).norm() < 5.0 * got.report.sigma_normal
 }
@@ -41,7 +41,7 @@ fn a_thousand_well_posed_scenes_are_all_answered_and_right() {
     for i in 0..1000 {
         let rim = random_rim(&mut r);
         let both_see = p.iter().all(|q| {
-            let o = graspd_calib::offline::cone::camera_centre(q).unwrap();
+            let o = graspd_calib::offline::rim::cone::camera_centre(q).unwrap();
             (o - rim.centre).normalize().dot(&rim.normal) > 0.17
         });
         if !both_see {

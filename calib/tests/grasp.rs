@@ -2,14 +2,14 @@
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::GripperFile;
-use graspd_calib::offline::cone::project;
-use graspd_calib::offline::grasp::{Approach, GraspError, LEAST_MARKS, choose};
+use graspd_calib::offline::edges::lens::projection;
+use graspd_calib::offline::handle::grasp::{Approach, GraspError, LEAST_MARKS, choose};
+use graspd_calib::offline::handle::setpoint::{RimObstacle, Scene, fewest_on_the_way};
 use graspd_calib::offline::handle::{FLAT, direction, gripper_pose};
-use graspd_calib::offline::lens::projection;
-use graspd_calib::offline::model::{EdgePoint, Options, Reconstruction, RimChoice};
-use graspd_calib::offline::reconstruct::reconstruct;
-use graspd_calib::offline::setpoint::{RimObstacle, Scene, fewest_on_the_way};
-use graspd_calib::offline::synthetic::{rim_point, rim_tilted};
+use graspd_calib::offline::rim::cone::project;
+use graspd_calib::offline::rim::model::{EdgePoint, Options, Reconstruction, RimChoice};
+use graspd_calib::offline::rim::reconstruct::reconstruct;
+use graspd_calib::offline::rim::synthetic::{rim_point, rim_tilted};
 use graspd_rt::geom::{Camera, Pose, Rig, Vec3, View};
 use nalgebra::UnitQuaternion;
 use std::f64::consts::{PI, TAU};

@@ -1,12 +1,12 @@
 //! Round-bar rims: a simulated torus wheel, its outlines in both views with noise.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
-use graspd_calib::offline::cone::{camera_centre, project};
-use graspd_calib::offline::model::{EdgePoint, Options, Projection, RimChoice, RimModel};
-use graspd_calib::offline::reconstruct::reconstruct;
-use graspd_calib::offline::refusal::Refusal;
-use graspd_calib::offline::synthetic::{Random, rig, rim_tilted};
-use graspd_calib::offline::torus::{Torus, outline};
+use graspd_calib::offline::bar::torus::{Torus, outline};
+use graspd_calib::offline::rim::cone::{camera_centre, project};
+use graspd_calib::offline::rim::model::{EdgePoint, Options, Projection, RimChoice, RimModel};
+use graspd_calib::offline::rim::reconstruct::reconstruct;
+use graspd_calib::offline::rim::refusal::Refusal;
+use graspd_calib::offline::rim::synthetic::{Random, rig, rim_tilted};
 use nalgebra::Vector3;
 use std::f64::consts::TAU;
 

@@ -1,43 +1,20 @@
-//! The off-line stage, one file per step of the paper: from edge points in two views to a rim in space and a grasp on it.
+//! The off-line stage, one folder per step of the paper, in the order in which a click passes through them:
+//!
+//! 1. [`edges`]: from a picture to sub-pixel edge points, and from the lens to ideal pixels.
+//! 2. [`contour`]: from a click to the edge points of one contour.
+//! 3. [`conic`]: from those points to an ellipse with its covariance.
+//! 4. [`pairs`]: which contours of the two views belong together (section 4.2, equation 4).
+//! 5. [`rim`]: from two ellipses to a circle or ellipse in space (section 4), refined, with its covariance; [`bar`]: the same for a round bar.
+//! 6. [`handle`]: from the rim to a grasp (section 3.2) and its set-point; [`polyhedral`]: from a CAD mesh to a grasp (section 3.1).
+//! 7. [`plan`]: all of it as one pure function; [`drawing`]: what people look at.
 
-pub mod arcs;
-mod barsearch;
-pub mod canvas;
-pub mod circle;
-pub mod cone;
+pub mod bar;
 pub mod conic;
 pub mod contour;
-pub mod correspondence;
+pub mod drawing;
 pub mod edges;
-pub mod eigen;
-mod follow;
-pub mod grasp;
 pub mod handle;
-pub mod lens;
-mod levenberg;
-pub mod ml;
-pub mod model;
-pub mod order;
-pub mod overlay;
-pub mod pairing;
-pub mod pencil;
-pub mod picture;
+pub mod pairs;
 pub mod plan;
-pub mod planar;
-pub mod plane;
 pub mod polyhedral;
-pub mod propose;
-mod quick_fit;
-pub mod reconstruct;
-pub mod refusal;
-pub mod report;
-pub mod robust;
-pub mod roundbar;
-pub mod sampson;
-pub mod select;
-pub mod setpoint;
-pub mod sharpen;
-pub mod synthetic;
-mod systematic;
-pub mod torus;
-pub mod visibility;
+pub mod rim;

@@ -1,20 +1,20 @@
 //! The whole off-line stage as one pure function: two pictures, what was selected in them, a rig and a gripper in; a plan or a reason out.
 
-use super::contour::{Contour, ViewEdges};
-use super::grasp::{self, Approach, Grasp, GraspError, object_frame};
-use super::lens::projection;
-use super::model::{self, Projection, Reconstruction, RimModel};
-use super::order::{self, Votes};
-use super::pairing::{self, Pair};
-use super::picture::Picture;
-use super::propose::{Proposal, propose};
-use super::refusal::Refusal;
-use super::select::{self, Candidate, SelectError, Selection};
-use super::setpoint::{RimObstacle, Scene, fewest_on_the_way};
 use crate::files::{
     ConeRecord, EdgeRecord, FileError, GoalRecord, GripperFile, MarkRecord, ModelRecord, ObjectRecord, PathRecord,
     PictureRecord, PlanFile, PoseRecord, RigFile, SelectionRecord, SourceRecord, ViewPair,
 };
+use crate::offline::contour::select::{self, Candidate, SelectError, Selection};
+use crate::offline::contour::{Contour, ViewEdges};
+use crate::offline::edges::lens::projection;
+use crate::offline::edges::picture::Picture;
+use crate::offline::handle::grasp::{self, Approach, Grasp, GraspError, object_frame};
+use crate::offline::handle::setpoint::{RimObstacle, Scene, fewest_on_the_way};
+use crate::offline::pairs::order::{self, Votes};
+use crate::offline::pairs::pairing::{self, Pair};
+use crate::offline::pairs::propose::{Proposal, propose};
+use crate::offline::rim::model::{self, Projection, Reconstruction, RimModel};
+use crate::offline::rim::refusal::Refusal;
 use graspd_rt::geom::{Pose, View};
 use graspd_rt::setpoint::{Goal, SetPoint};
 
@@ -432,7 +432,7 @@ where
 
 fn object_record(r: &Reconstruction) -> ObjectRecord {
     let frame = object_frame(r);
-    let e = super::circle::frame_of(&r.rim.normal);
+    let e = crate::offline::rim::circle::frame_of(&r.rim.normal);
     let x = frame.rotation * nalgebra::Vector3::x();
     let (c, s) = (x.dot(&e.column(0)), x.dot(&e.column(1)));
     let turn = nalgebra::Matrix2::new(c, s, -s, c);

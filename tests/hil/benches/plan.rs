@@ -3,13 +3,13 @@
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::RigFile;
-use graspd_calib::offline::arcs::Arcs;
+use graspd_calib::offline::contour::select::Selection;
+use graspd_calib::offline::drawing::overlay;
 use graspd_calib::offline::edges::EdgeMap;
-use graspd_calib::offline::lens::Lens;
-use graspd_calib::offline::overlay;
-use graspd_calib::offline::picture::Picture;
+use graspd_calib::offline::edges::arcs::Arcs;
+use graspd_calib::offline::edges::lens::Lens;
+use graspd_calib::offline::edges::picture::Picture;
 use graspd_calib::offline::plan::{PlanOptions, Prepared, plan};
-use graspd_calib::offline::select::Selection;
 use graspd_hil::scenario::{Options, Scenario};
 use graspd_hil::scene::Snapshot;
 use graspd_rt::geom::{Vec3, View};

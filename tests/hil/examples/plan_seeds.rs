@@ -2,9 +2,9 @@
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::RigFile;
-use graspd_calib::offline::picture::Picture;
+use graspd_calib::offline::contour::select::Selection;
+use graspd_calib::offline::edges::picture::Picture;
 use graspd_calib::offline::plan::{PlanOptions, plan};
-use graspd_calib::offline::select::Selection;
 use graspd_hil::scenario::{Options, Scenario};
 use graspd_rt::geom::View;
 

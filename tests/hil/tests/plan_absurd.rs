@@ -4,9 +4,9 @@
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::{GripperFile, RigFile};
-use graspd_calib::offline::picture::Picture;
+use graspd_calib::offline::contour::select::Selection;
+use graspd_calib::offline::edges::picture::Picture;
 use graspd_calib::offline::plan::{Plan, PlanError, PlanOptions, Prepared};
-use graspd_calib::offline::select::Selection;
 use graspd_hil::scenario::{Circle, Options, Scenario};
 use graspd_hil::scene::Snapshot;
 use graspd_rt::geom::{Pixel, Vec3, View};

@@ -4,10 +4,10 @@
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::RigFile;
-use graspd_calib::offline::model::{RimChoice, RimModel};
-use graspd_calib::offline::picture::Picture;
+use graspd_calib::offline::contour::select::Selection;
+use graspd_calib::offline::edges::picture::Picture;
 use graspd_calib::offline::plan::{Plan, PlanError, PlanOptions, plan};
-use graspd_calib::offline::select::Selection;
+use graspd_calib::offline::rim::model::{RimChoice, RimModel};
 use graspd_hil::scenario::{Options, Scenario};
 use graspd_hil::scene::Snapshot;
 use graspd_rt::geom::{Pixel, Pose, Vec3, View};
@@ -45,7 +45,8 @@ fn run(s: &Scenario, shot: &Snapshot, clicks: [Pixel; 2], rim: RimChoice) -> Res
     gripper.opening[1] = 1.0;
     let found = plan([&pair[0], &pair[1]], [&selections[0], &selections[1]], &rig, &gripper, &options);
     if let (Ok(p), Ok(dir)) = (&found, std::env::var("GRASPD_PICTURES")) {
-        let png = graspd_calib::offline::overlay::draw(p, [&pair[0], &pair[1]], &rig, &gripper).unwrap_or_default();
+        let png =
+            graspd_calib::offline::drawing::overlay::draw(p, [&pair[0], &pair[1]], &rig, &gripper).unwrap_or_default();
         let _ = std::fs::write(format!("{dir}/world-{}-{rim:?}.png", s.seed), png);
         for (k, p) in pair.iter().enumerate() {
             let head = format!("P5\n{} {}\n255\n", p.width(), p.height());

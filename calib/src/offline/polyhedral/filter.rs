@@ -4,8 +4,8 @@ use super::bvh::Bvh;
 use super::handles::{BoxHandle, Handles, Overlap};
 use super::reach::Arm;
 use crate::files::{GripperFile, OrientedBox};
-use crate::offline::grasp::LEAST_MARKS;
-use crate::offline::setpoint::{Obstacle, Scene};
+use crate::offline::handle::grasp::LEAST_MARKS;
+use crate::offline::handle::setpoint::{Obstacle, Scene};
 use graspd_rt::geom::{Pose, Rig, Vec3};
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion};
 

@@ -4,9 +4,9 @@ use super::mesh::Mesh;
 use super::plan::{MeshPlan, Placed, Survey};
 use super::topology::edges;
 use crate::files::{GripperFile, RigFile};
-use crate::offline::canvas::{Face, Rgba};
-use crate::offline::overlay::{BRIGHT, CLICK, DIM, MARK, NORMAL, Panel, RIM, boxes, scales, sheet};
-use crate::offline::picture::Picture;
+use crate::offline::drawing::canvas::{Face, Rgba};
+use crate::offline::drawing::overlay::{BRIGHT, CLICK, DIM, MARK, NORMAL, Panel, RIM, boxes, scales, sheet};
+use crate::offline::edges::picture::Picture;
 use graspd_rt::geom::{Pixel, Pose, Vec3, View};
 use nalgebra::Point3;
 

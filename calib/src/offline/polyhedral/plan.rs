@@ -10,9 +10,9 @@ use crate::files::{
     CandidateRecord, FileError, GripRecord, GripperFile, MeshRecord, ObjectRecord, PathRecord, PlanFile, PoseRecord,
     RigFile, SourceRecord,
 };
-use crate::offline::grasp::LEAST_MARKS;
+use crate::offline::handle::grasp::LEAST_MARKS;
+use crate::offline::handle::setpoint::{Scene, fewest_on_the_way};
 use crate::offline::plan::{goal_record, worst};
-use crate::offline::setpoint::{Scene, fewest_on_the_way};
 use graspd_rt::geom::{Pose, Vec3};
 use graspd_rt::setpoint::SetPoint;
 use nalgebra::Matrix6;

@@ -1,6 +1,6 @@
 //! Where a mesh stands, from points of it that were picked in both pictures.
 
-use crate::offline::lens::Lens;
+use crate::offline::edges::lens::Lens;
 use graspd_rt::geom::{Pixel, Pose, Rig, Vec3, View, exp_twist};
 use nalgebra::{Matrix3, Matrix6, Point3, UnitQuaternion, Vector6};
 

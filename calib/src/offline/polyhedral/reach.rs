@@ -54,7 +54,7 @@ impl Arm {
             return false;
         }
         for k in 1..=PIECES {
-            let pose = crate::offline::setpoint::between(from, to, k as f64 / PIECES as f64);
+            let pose = crate::offline::handle::setpoint::between(from, to, k as f64 / PIECES as f64);
             let Ok(next) = newton(&self.dh, &self.flange(&pose), &q) else { return false };
             let most = next.iter().zip(q.iter()).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
             if !(most <= MOST_STEP && self.within(&next)) {

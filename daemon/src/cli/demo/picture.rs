@@ -2,7 +2,7 @@
 
 use super::watch::Trajectories;
 use crate::exit::Failure;
-use graspd_calib::offline::canvas::{Canvas, Face, Rgba};
+use graspd_calib::offline::drawing::canvas::{Canvas, Face, Rgba};
 use graspd_rt::geom::Pixel;
 use std::path::Path;
 

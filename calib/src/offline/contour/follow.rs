@@ -1,0 +1,165 @@
+//! Edge points along a curve that is known beforehand: the outline that a model predicts, followed in the picture.
+//!
+//! Growing a contour asks which edges lie on one ellipse. Here the curve is given (the outline of a bar is no ellipse), and only the edges next to
+//! it are wanted, one for each stretch that is independent of its neighbours, told apart from nearby ones and brought to their place.
+
+use crate::offline::contour::quick_fit::{Sums, Walk};
+use crate::offline::contour::{Contour, ContourPoint, FLOOR_PX, INDEPENDENT_PX, LEAST_COVERAGE, ViewEdges};
+use crate::offline::edges::sharpen::sharpen;
+use crate::offline::edges::{Refined, refine};
+use crate::offline::rim::model::{EdgePoint, Outline};
+use graspd_rt::geom::Pixel;
+
+/// A place on a predicted curve, ideal pixels.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::offline) struct Place {
+    pub(in crate::offline) at: Pixel,
+    /// Unit normal, to the outside of the outline.
+    pub(in crate::offline) normal: Pixel,
+    /// Signed radius of curvature, positive where the inside of the curve lies against the normal.
+    pub(in crate::offline) radius: f64,
+}
+
+/// Where a curve carries edges.
+#[derive(Clone, Debug, Default)]
+pub(in crate::offline) struct Support {
+    /// Places that lie in the picture.
+    pub(in crate::offline) seen: usize,
+    /// Edge found at each place, if any.
+    pub(in crate::offline) hits: Vec<Option<u32>>,
+}
+
+impl Support {
+    pub(in crate::offline) fn coverage(&self) -> f64 {
+        self.hits.iter().flatten().count() as f64 / self.seen.max(1) as f64
+    }
+}
+
+/// Places along a closed polygon of ideal pixels at about one `step`; stretches between flagged-out corners are left out.
+pub(in crate::offline) fn places(curve: &[Option<Pixel>], step: f64, inside: Pixel) -> Vec<Place> {
+    let n = curve.len();
+    let get = |k: usize| curve.get(k % n.max(1)).copied().flatten();
+    let mut out = Vec::new();
+    let mut since = f64::INFINITY;
+    for k in 0..n {
+        let (Some(p), Some(q), Some(o)) = (get(k + n - 1), get(k), get(k + 1)) else {
+            since = f64::INFINITY;
+            continue;
+        };
+        since += (q - p).norm();
+        if since < step {
+            continue;
+        }
+        let along = o - p;
+        let Some(t) = along.try_normalize(1e-6) else { continue };
+        let mut normal = Pixel::new(t.y, -t.x);
+        if normal.dot(&(q - inside)) < 0.0 {
+            normal = -normal;
+        }
+        // The circle through three neighbours.
+        let area = 0.5 * ((q - p).x * (o - p).y - (q - p).y * (o - p).x);
+        let sides = (q - p).norm() * (o - q).norm() * along.norm();
+        let towards = (p + o) * 0.5 - q;
+        let sign = if towards.dot(&normal) < 0.0 { 1.0 } else { -1.0 };
+        let radius = if area.abs() > 1e-12 { sign * sides / (4.0 * area.abs()) } else { f64::INFINITY };
+        out.push(Place { at: q, normal, radius });
+        since = 0.0;
+    }
+    out
+}
+
+impl ViewEdges<'_> {
+    /// The edges next to places of a curve, whichever side is brighter; `bright_inside` asks for one.
+    pub(in crate::offline) fn support(&self, places: &[Place], tolerance: f64, bright_inside: Option<bool>) -> Support {
+        let mut out = Support::default();
+        for p in places {
+            let raw = self.lens.raw(p.at);
+            if !self.picture.contains(raw, 6.0) {
+                continue;
+            }
+            out.seen += 1;
+            let mut best = (tolerance, None);
+            for (k, _) in self.map.near(raw, tolerance.ceil() as i32) {
+                let Some(i) = self.arcs.ideal.get(k) else { continue };
+                let d = i.at - p.at;
+                let along = i.towards_bright.dot(&p.normal);
+                let side_fits = bright_inside.is_none_or(|inside| (along < 0.0) == inside);
+                let off = d.dot(&p.normal).abs();
+                if side_fits && along.abs() > 0.93 && off < best.0 && d.norm() < tolerance + 1.5 {
+                    best = (off, Some(k as u32));
+                }
+            }
+            out.hits.push(best.1);
+        }
+        out
+    }
+
+    /// The contour along a curve: its edges within a tolerance, told apart from their neighbours. Its ellipse is only the nearest one.
+    pub(in crate::offline) fn follow(&self, places: &[Place], tolerance: f64, sharp: bool) -> Option<Contour> {
+        let any = self.support(places, tolerance, None);
+        let bright =
+            |k: u32, p: &Place| self.arcs.ideal.get(k as usize).is_some_and(|i| i.towards_bright.dot(&p.normal) < 0.0);
+        let seen: Vec<&Place> = places.iter().filter(|p| self.picture.contains(self.lens.raw(p.at), 6.0)).collect();
+        let (mut inside, mut outside) = (0usize, 0usize);
+        for (h, p) in any.hits.iter().zip(&seen) {
+            if let Some(k) = h {
+                *(if bright(*k, p) { &mut inside } else { &mut outside }) += 1;
+            }
+        }
+        // One side is the brighter nearly everywhere, unless the background changes behind a bar.
+        let bright_inside = inside > outside;
+        let mixed = inside.min(outside) * 4 > inside.max(outside);
+        let support = self.support(places, tolerance, (!mixed).then_some(bright_inside));
+        let mut points = Vec::new();
+        let mut rejected = Vec::new();
+        let mut used = std::collections::BTreeSet::new();
+        for (h, p) in support.hits.iter().zip(&seen) {
+            let Some(k) = h.filter(|k| used.insert(*k)) else { continue };
+            let Some(edge) = self.map.edges().get(k as usize) else { continue };
+            let Some(r) = refine(self.picture, edge, self.map.noise()) else {
+                rejected.push(edge.at);
+                continue;
+            };
+            let sign = if r.towards_bright.dot(&p.normal) < 0.0 { -1.0 } else { 1.0 };
+            let r = if sharp {
+                let ahead = self.lens.raw(p.at + p.normal * 0.5) - self.lens.raw(p.at - p.normal * 0.5);
+                let Some(towards_bright) = (ahead * sign).try_normalize(1e-9) else { continue };
+                match sharpen(self.picture, &Refined { towards_bright, ..r }, self.map.noise(), self.blur()) {
+                    Some(r) => r,
+                    None => {
+                        rejected.push(edge.at);
+                        continue;
+                    }
+                }
+            } else {
+                r
+            };
+            let outward = if p.radius < 0.0 { -p.normal } else { p.normal };
+            let r = r.straightened(outward, p.radius.abs());
+            let Some(ideal) = self.lens.ideal(r.at) else { continue };
+            let residual = (ideal - p.at).dot(&p.normal);
+            let edge = EdgePoint { uv: ideal, sigma: r.sigma.hypot(FLOOR_PX), outline: Outline::Outer };
+            points.push(ContourPoint { raw: r.at, edge, residual, parameter: 0.0 });
+        }
+        if points.len() < 12 {
+            return None;
+        }
+        let first = points.first()?.edge.uv;
+        let mut sums = Sums::new(first, 50.0);
+        points.iter().for_each(|p| sums.add(p.edge.uv, 1.0));
+        let ellipse = sums.ellipse()?;
+        let w = Walk::new(&ellipse);
+        for p in &mut points {
+            p.parameter = w.measure(p.edge.uv).2;
+        }
+        points.sort_by(|a, b| a.parameter.total_cmp(&b.parameter));
+        let n = points.len() as f64;
+        let rms_px = (points.iter().map(|p| p.residual * p.residual).sum::<f64>() / n).sqrt();
+        let coverage = (n / support.seen.max(1) as f64).min(1.0);
+        let good = coverage >= LEAST_COVERAGE;
+        good.then_some(Contour { ellipse, bright_inside, points, rejected, coverage, rms_px })
+    }
+}
+
+/// How far apart the places of a followed curve stand, pixels.
+pub(in crate::offline) const STEP_PX: f64 = INDEPENDENT_PX;

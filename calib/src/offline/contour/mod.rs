@@ -1,0 +1,492 @@
+//! A contour: the edge points of one ellipse, gathered through gaps, spokes and occlusions.
+//!
+//! A seed edge and its arc are tried alone and with every other arc of the picture that could lie on the same convex curve with the same brighter side;
+//! each trial ellipse is judged by how much of it carries edges of the right direction. The best few are fitted again to the edges they gathered until
+//! they stop changing, then the edges in a narrow band are taken by consensus, thinned to independent ones and refined.
+
+pub(in crate::offline) mod follow;
+pub(in crate::offline) mod quick_fit;
+pub mod select;
+
+use crate::offline::contour::quick_fit::{Sums, Walk};
+use crate::offline::edges::arcs::Arcs;
+use crate::offline::edges::lens::Lens;
+use crate::offline::edges::picture::Picture;
+use crate::offline::edges::sharpen::{lens_blur, sharpen};
+use crate::offline::edges::{self, EdgeMap, Refined};
+use crate::offline::rim::model::{EdgePoint, Ellipse2, Outline};
+use graspd_rt::geom::{Camera, Pixel};
+
+/// Edges closer together than this share most of their pixels (2 sqrt(pi) times the smoothing), so that they count as one.
+pub(in crate::offline) const INDEPENDENT_PX: f64 = 3.5;
+/// Uncertainty of an edge that no pixel noise explains: lens residue, detector non-uniformity, the rim's own roughness.
+pub(in crate::offline) const FLOOR_PX: f64 = 0.03;
+/// Edges that scatter more about their ellipse belong to several contours. A round bar's outline, which is none, stays below half of it.
+const MOST_SCATTER_PX: f64 = 0.9;
+/// Smallest part of an ellipse that has to carry edges.
+pub(in crate::offline) const LEAST_COVERAGE: f64 = 0.25;
+
+/// A picture with everything that contours are grown from.
+#[derive(Clone, Debug)]
+pub struct ViewEdges<'a> {
+    /// The picture.
+    pub picture: &'a Picture,
+    /// Its edge points.
+    pub map: EdgeMap,
+    /// Their arcs.
+    pub arcs: Arcs,
+    /// The lens.
+    pub lens: Lens,
+    /// Up to 16 edges of each arc, evenly spaced.
+    samples: Vec<Vec<u32>>,
+    /// Arcs by falling length.
+    longest: Vec<u32>,
+    blur: std::cell::OnceCell<f64>,
+}
+
+/// An edge point of a contour.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ContourPoint {
+    /// Where it is in the picture.
+    pub raw: Pixel,
+    /// The same without lens distortion, with its standard deviation.
+    pub edge: EdgePoint,
+    /// Signed distance from the ellipse, ideal pixels, positive outside.
+    pub residual: f64,
+    /// Parameter of the place on the ellipse, radians.
+    pub parameter: f64,
+}
+
+/// The edge points of one ellipse in one view.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Contour {
+    /// The ellipse in ideal pixels.
+    pub ellipse: Ellipse2,
+    /// Whether the inside is the brighter side.
+    pub bright_inside: bool,
+    /// The edge points that lie on it, in order round it.
+    pub points: Vec<ContourPoint>,
+    /// Edges of the right direction near it that do not (raw pixels).
+    pub rejected: Vec<Pixel>,
+    /// Part of the ellipse that carries edge points.
+    pub coverage: f64,
+    /// Root mean square distance of the points, pixels.
+    pub rms_px: f64,
+}
+
+impl Contour {
+    /// Root mean square of the predicted standard deviations, pixels.
+    pub fn sigma_px(&self) -> f64 {
+        let n = self.points.len().max(1) as f64;
+        (self.points.iter().map(|p| p.edge.sigma * p.edge.sigma).sum::<f64>() / n).sqrt()
+    }
+
+    /// Distance of a raw pixel from the nearest edge point.
+    pub fn distance(&self, raw: Pixel) -> f64 {
+        self.points.iter().map(|p| (p.raw - raw).norm()).fold(f64::INFINITY, f64::min)
+    }
+
+    /// The edge points as the reconstruction takes them.
+    pub fn edge_points(&self, outline: Outline) -> Vec<EdgePoint> {
+        self.points.iter().map(|p| EdgePoint { outline, ..p.edge }).collect()
+    }
+}
+
+/// A trial ellipse and how well it is supported.
+#[derive(Clone, Debug)]
+pub(in crate::offline) struct Trial {
+    pub(in crate::offline) ellipse: Ellipse2,
+    pub(in crate::offline) bright_inside: bool,
+    pub(in crate::offline) coverage: f64,
+    pub(in crate::offline) score: f64,
+    hits: Vec<u32>,
+}
+
+impl<'a> ViewEdges<'a> {
+    /// Detects and links the edges of a picture taken by this camera.
+    pub fn new(picture: &'a Picture, camera: &Camera) -> Self {
+        let map = EdgeMap::detect(picture);
+        let lens = Lens::new(camera);
+        let arcs = Arcs::link(&map, &lens);
+        let samples = arcs
+            .arcs
+            .iter()
+            .map(|a| {
+                let step = (a.edges.len() as f64 / 16.0).max(1.0);
+                let n = (a.edges.len() as f64 / step) as usize;
+                (0..n).filter_map(|k| a.edges.get(((k as f64 + 0.5) * step) as usize).copied()).collect()
+            })
+            .collect();
+        let mut longest: Vec<u32> = (0..arcs.arcs.len() as u32).collect();
+        longest.sort_by_key(|k| std::cmp::Reverse(arcs.arcs.get(*k as usize).map_or(0, |a| a.edges.len())));
+        Self { picture, map, arcs, lens, samples, longest, blur: std::cell::OnceCell::new() }
+    }
+
+    /// Trial ellipses through a seed edge, best first, at most `keep` and no two alike.
+    pub(in crate::offline) fn trials(&self, seed: usize, keep: usize) -> Vec<Trial> {
+        let (Some(s), Some(own)) = (self.arcs.ideal.get(seed), self.arcs.of(seed)) else { return Vec::new() };
+        let Some(arc) = self.arcs.arcs.get(own) else { return Vec::new() };
+        if !s.at.x.is_finite() {
+            return Vec::new();
+        }
+        let place = arc.edges.iter().position(|k| *k as usize == seed).unwrap_or(0);
+        let blank = Sums::new(s.at, 100.0);
+        let piece = |half: usize| {
+            let mut sums = blank;
+            let (from, to) = (place.saturating_sub(half), (place + half + 1).min(arc.edges.len()));
+            let step = ((to - from) / 40).max(1);
+            for k in arc.edges.get(from..to).unwrap_or(&[]).iter().step_by(step) {
+                if let Some(e) = self.arcs.ideal.get(*k as usize) {
+                    sums.add(e.at, 1.0);
+                }
+            }
+            sums
+        };
+        let mut found: Vec<Trial> = Vec::new();
+        let mut offer = |t: Option<Trial>| {
+            if let Some(t) = t {
+                if found.len() < 4 * keep || found.iter().any(|f| f.score < t.score) {
+                    found.push(t);
+                    found.sort_by(|a, b| b.score.total_cmp(&a.score));
+                    found.truncate(4 * keep);
+                }
+            }
+        };
+        for half in [25, 50, 100, 200, 5000] {
+            offer(self.trial(&piece(half), seed));
+            if half > arc.edges.len() {
+                break;
+            }
+        }
+        let near = piece(60);
+        for k in self.longest.iter().take(1500) {
+            if *k as usize == own {
+                continue;
+            }
+            let Some(samples) = self.samples.get(*k as usize) else { continue };
+            if !self.could_join(s, samples) {
+                continue;
+            }
+            let mut sums = blank;
+            for e in samples.iter().filter_map(|k| self.arcs.ideal.get(*k as usize)) {
+                sums.add(e.at, 1.0);
+            }
+            offer(self.trial(&near.plus(&sums), seed));
+        }
+        let mut out: Vec<Trial> = Vec::new();
+        for t in found {
+            let Some(t) = self.settle(t, seed) else { continue };
+            if t.coverage >= 0.8 * LEAST_COVERAGE && !out.iter().any(|o| alike(&o.ellipse, &t.ellipse)) {
+                out.push(t);
+            }
+        }
+        out.sort_by(|a, b| b.score.total_cmp(&a.score));
+        out.truncate(keep);
+        out
+    }
+
+    /// Whether an arc could lie on one convex curve with the seed, the same side brighter.
+    fn could_join(&self, s: &crate::offline::edges::arcs::IdealEdge, samples: &[u32]) -> bool {
+        let (mut inside, mut outside) = (0, 0);
+        for e in [samples.first(), samples.get(samples.len() / 2), samples.last()].into_iter().flatten() {
+            let Some(e) = self.arcs.ideal.get(*e as usize) else { return false };
+            let d = e.at - s.at;
+            let (a, b) = (s.towards_bright.dot(&d), -e.towards_bright.dot(&d));
+            let slack = 2.0 + 0.03 * d.norm();
+            if a > -slack && b > -slack {
+                inside += 1;
+            }
+            if a < slack && b < slack {
+                outside += 1;
+            }
+        }
+        inside == 3 || outside == 3
+    }
+
+    /// The ellipse of some sums as a trial, if it passes the seed in the seed's direction.
+    fn trial(&self, sums: &Sums, seed: usize) -> Option<Trial> {
+        let e = sums.ellipse()?;
+        let s = self.arcs.ideal.get(seed)?;
+        let (d, n, _) = Walk::new(&e).measure(s.at);
+        let along = s.towards_bright.dot(&n);
+        if d.abs() > 2.5 || along.abs() < 0.9 {
+            return None;
+        }
+        self.judge(&e, along < 0.0, 3.0)
+    }
+
+    /// Judges an ellipse by the edges along it.
+    pub(in crate::offline) fn judge(&self, e: &Ellipse2, bright_inside: bool, tolerance: f64) -> Option<Trial> {
+        let most = 1.5 * self.map.width().max(self.map.height()) as f64;
+        if !(e.b > 4.0 && e.a < most && e.b > 0.04 * e.a) {
+            return None;
+        }
+        let w = Walk::new(e);
+        let sign = if bright_inside { -1.0 } else { 1.0 };
+        let parameters = w.parameters(3.0, 160);
+        let (mut seen, mut hits) = (0usize, Vec::new());
+        for t in &parameters {
+            let (p, n) = w.at(*t);
+            let raw = self.lens.raw(p);
+            if !self.picture.contains(raw, 6.0) {
+                continue;
+            }
+            seen += 1;
+            let mut best = (tolerance, None);
+            for (k, _) in self.map.near(raw, tolerance.ceil() as i32) {
+                let Some(i) = self.arcs.ideal.get(k) else { continue };
+                let d = i.at - p;
+                if i.towards_bright.dot(&n) * sign > 0.94 && d.dot(&n).abs() < best.0 && d.norm() < tolerance + 1.5 {
+                    best = (d.dot(&n).abs(), Some(k as u32));
+                }
+            }
+            hits.extend(best.1);
+        }
+        if seen * 5 < parameters.len() * 2 {
+            return None;
+        }
+        let coverage = hits.len() as f64 / seen.max(1) as f64;
+        let score = coverage * coverage * w.perimeter().sqrt();
+        Some(Trial { ellipse: *e, bright_inside, coverage, score, hits })
+    }
+
+    /// Fits a trial again to the edges it gathered until it stops changing; it must go on passing the seed.
+    fn settle(&self, start: Trial, seed: usize) -> Option<Trial> {
+        let s = self.arcs.ideal.get(seed)?;
+        let mut best = start;
+        for k in 0..6 {
+            let mut sums = Sums::new(best.ellipse.centre, best.ellipse.a);
+            for e in best.hits.iter().filter_map(|k| self.arcs.ideal.get(*k as usize)) {
+                sums.add(e.at, 1.0);
+            }
+            // The seed and its neighbourhood hold the ellipse to the contour that was meant.
+            sums.add(s.at, 0.1 * best.hits.len() as f64);
+            let Some(e) = sums.ellipse() else { break };
+            let Some(t) = self.judge(&e, best.bright_inside, if k < 2 { 3.0 } else { 2.0 }) else { break };
+            let (d, n, _) = Walk::new(&t.ellipse).measure(s.at);
+            if d.abs() > 2.0 || s.towards_bright.dot(&n).abs() < 0.9 {
+                break;
+            }
+            let same = alike(&t.ellipse, &best.ellipse) && t.hits.len() == best.hits.len();
+            best = t;
+            if same {
+                break;
+            }
+        }
+        Some(best)
+    }
+
+    /// The contour of a trial: edges by consensus, thinned, refined, with their ellipse. `None` when too little is left.
+    pub(in crate::offline) fn contour(&self, trial: &Trial) -> Option<Contour> {
+        let sign = if trial.bright_inside { -1.0 } else { 1.0 };
+        let mut e = trial.ellipse;
+        let band = self.band(&e, sign);
+        // Consensus: from a wide band to one of a few standard deviations, by the median so that half of them may be wrong.
+        let mut width = 2.5;
+        for _ in 0..8 {
+            let w = Walk::new(&e);
+            let mut sums = Sums::new(e.centre, e.a);
+            let mut far = Vec::new();
+            for k in &band {
+                let Some(i) = self.arcs.ideal.get(*k as usize) else { continue };
+                let (d, n, t) = w.measure(i.at);
+                if d.abs() < width && i.towards_bright.dot(&n) * sign > 0.95 {
+                    let tukey = (1.0 - (d / width).powi(2)).powi(2);
+                    let (st, ct) = t.sin_cos();
+                    let slope2 = (ct / e.a).powi(2) + (st / e.b).powi(2);
+                    sums.add(i.at, tukey / slope2);
+                    far.push(d.abs());
+                }
+            }
+            if far.len() < 12 {
+                return None;
+            }
+            e = sums.ellipse()?;
+            far.sort_by(f64::total_cmp);
+            let median = far.get(far.len() / 2).copied().unwrap_or(0.0);
+            width = (4.5 * 1.48 * median).clamp(0.7, width);
+        }
+        self.refined(&e, sign, &band, width)
+    }
+
+    /// Edges near an ellipse, of any distance up to four pixels, in raster order.
+    fn band(&self, e: &Ellipse2, sign: f64) -> Vec<u32> {
+        let w = Walk::new(e);
+        let mut band: Vec<u32> = Vec::new();
+        for t in w.parameters(1.5, 20_000) {
+            let (p, n) = w.at(t);
+            let raw = self.lens.raw(p);
+            for (k, _) in self.map.near(raw, 4) {
+                let Some(i) = self.arcs.ideal.get(k) else { continue };
+                if i.towards_bright.dot(&n) * sign > 0.9 {
+                    band.push(k as u32);
+                }
+            }
+        }
+        band.sort_unstable();
+        band.dedup();
+        band
+    }
+
+    fn refined(&self, start: &Ellipse2, sign: f64, band: &[u32], width: f64) -> Option<Contour> {
+        let e = *start;
+        let w = Walk::new(&e);
+        let bins = ((w.perimeter() / INDEPENDENT_PX) as usize).clamp(12, 4000);
+        // In each bin the edge nearest its middle, so that the points stand apart.
+        let mut chosen: Vec<Option<(f64, u32)>> = vec![None; bins];
+        let at_bin = bin_of(&w, bins);
+        let mut rejected = Vec::new();
+        for k in band {
+            let (Some(i), Some(edge)) = (self.arcs.ideal.get(*k as usize), self.map.edges().get(*k as usize)) else {
+                continue;
+            };
+            let (d, n, t) = w.measure(i.at);
+            if d.abs() > width || i.towards_bright.dot(&n) * sign < 0.95 {
+                if d.abs() < 4.0 {
+                    rejected.push(edge.at);
+                }
+                continue;
+            }
+            let place = at_bin(t);
+            let off = (place.fract() - 0.5).abs();
+            if let Some(slot) = chosen.get_mut((place as usize).min(bins - 1)) {
+                if slot.is_none_or(|(o, _)| off < o) {
+                    *slot = Some((off, *k));
+                }
+            }
+        }
+        let mut points: Vec<ContourPoint> = Vec::new();
+        for (_, k) in chosen.iter().flatten() {
+            let Some(edge) = self.map.edges().get(*k as usize) else { continue };
+            let Some(r) = edges::refine(self.picture, edge, self.map.noise()) else { continue };
+            let Some(ideal) = self.lens.ideal(r.at) else { continue };
+            let (_, n, t) = w.measure(ideal);
+            // Lens distortion turns the normal by far less than matters for a shift of hundredths of a pixel.
+            let r = r.straightened(n, w.radius(t));
+            let Some(ideal) = self.lens.ideal(r.at) else { continue };
+            let sigma = r.sigma.hypot(FLOOR_PX);
+            let edge = EdgePoint { uv: ideal, sigma, outline: Outline::Outer };
+            points.push(ContourPoint { raw: r.at, edge, residual: 0.0, parameter: t });
+        }
+        points_on_one_ellipse(points, e, sign < 0.0, bins, rejected)
+    }
+
+    /// Standard deviation of a sharp edge's picture, pixels; measured once.
+    pub(in crate::offline) fn blur(&self) -> f64 {
+        *self.blur.get_or_init(|| lens_blur(self.picture, &self.map))
+    }
+
+    /// The same contour with every edge told apart from its neighbours (see [`crate::offline::edges::sharpen`]); the contour itself where too few can be.
+    pub(in crate::offline) fn sharpened(&self, c: &Contour) -> Contour {
+        let blur = self.blur();
+        let w = Walk::new(&c.ellipse);
+        let sign = if c.bright_inside { -1.0 } else { 1.0 };
+        let mut points = Vec::new();
+        let mut rejected = c.rejected.clone();
+        for p in &c.points {
+            let (_, n, t) = w.measure(p.edge.uv);
+            // The ellipse knows the direction of the edge better than one pixel's gradient does.
+            let ahead = self.lens.raw(p.edge.uv + n * 0.5) - self.lens.raw(p.edge.uv - n * 0.5);
+            let Some(towards_bright) = (ahead * sign).try_normalize(1e-9) else { continue };
+            let start = Refined { at: p.raw, towards_bright, sigma: p.edge.sigma, width: 1.0 };
+            match sharpen(self.picture, &start, self.map.noise(), blur) {
+                Some(r) => {
+                    let r = r.straightened(n, w.radius(t));
+                    let Some(ideal) = self.lens.ideal(r.at) else { continue };
+                    let edge = EdgePoint { uv: ideal, sigma: r.sigma.hypot(FLOOR_PX), outline: Outline::Outer };
+                    points.push(ContourPoint { raw: r.at, edge, residual: 0.0, parameter: t });
+                }
+                None => rejected.push(p.raw),
+            }
+        }
+        if points.len() * 2 < c.points.len() {
+            return c.clone();
+        }
+        let bins = ((w.perimeter() / INDEPENDENT_PX) as usize).clamp(12, 4000);
+        points_on_one_ellipse(points, c.ellipse, c.bright_inside, bins, rejected).unwrap_or_else(|| c.clone())
+    }
+}
+
+/// Fits the ellipse to refined points, drops those that do not lie on it, and puts the rest in order.
+fn points_on_one_ellipse(
+    mut points: Vec<ContourPoint>,
+    mut e: Ellipse2,
+    bright_inside: bool,
+    bins: usize,
+    mut rejected: Vec<Pixel>,
+) -> Option<Contour> {
+    for round in 0..4 {
+        let w = Walk::new(&e);
+        let mut sums = Sums::new(e.centre, e.a);
+        for p in &mut points {
+            let (d, _, t) = w.measure(p.edge.uv);
+            p.residual = d;
+            p.parameter = t;
+        }
+        let mut far: Vec<f64> = points.iter().map(|p| p.residual.abs()).collect();
+        far.sort_by(f64::total_cmp);
+        let scale = 1.48 * far.get(far.len() / 2).copied()?;
+        if round == 2 {
+            let limit = (4.0 * scale).max(0.15);
+            points.retain(|p| {
+                let ok = p.residual.abs() <= limit;
+                if !ok {
+                    rejected.push(p.raw);
+                }
+                ok
+            });
+        }
+        let c = (5.0 * scale).max(0.2);
+        for p in points.iter().filter(|p| p.residual.abs() < c) {
+            let (st, ct) = p.parameter.sin_cos();
+            let slope2 = (ct / e.a).powi(2) + (st / e.b).powi(2);
+            sums.add(p.edge.uv, (1.0 - (p.residual / c).powi(2)).powi(2) / (slope2 * p.edge.sigma * p.edge.sigma));
+        }
+        if points.len() < 12 {
+            return None;
+        }
+        e = sums.ellipse()?;
+    }
+    let w = Walk::new(&e);
+    for p in &mut points {
+        let (d, _, t) = w.measure(p.edge.uv);
+        p.residual = d;
+        p.parameter = t;
+    }
+    points.sort_by(|a, b| a.parameter.total_cmp(&b.parameter));
+    let n = points.len() as f64;
+    let rms_px = (points.iter().map(|p| p.residual * p.residual).sum::<f64>() / n).sqrt();
+    let coverage = (n / bins as f64).min(1.0);
+    rejected.sort_by(|a, b| a.y.total_cmp(&b.y).then(a.x.total_cmp(&b.x)));
+    let good = coverage >= LEAST_COVERAGE && rms_px <= MOST_SCATTER_PX;
+    good.then_some(Contour { ellipse: e, bright_inside, points, rejected, coverage, rms_px })
+}
+
+/// Place along an ellipse in bins of equal arc length.
+fn bin_of(w: &Walk, bins: usize) -> impl Fn(f64) -> f64 {
+    const FINE: usize = 720;
+    let dt = std::f64::consts::TAU / FINE as f64;
+    let mut length = Vec::with_capacity(FINE + 1);
+    let mut sum = 0.0;
+    length.push(0.0);
+    for k in 0..FINE {
+        let (a, b) = (w.at(k as f64 * dt).0, w.at((k + 1) as f64 * dt).0);
+        sum += (b - a).norm();
+        length.push(sum);
+    }
+    move |t: f64| {
+        let x = t.rem_euclid(std::f64::consts::TAU) / dt;
+        let k = (x as usize).min(FINE - 1);
+        let (a, b) = (length.get(k).copied().unwrap_or(0.0), length.get(k + 1).copied().unwrap_or(sum));
+        (a + (b - a) * (x - k as f64)) / sum.max(1e-12) * bins as f64
+    }
+}
+
+/// Whether two ellipses are the same to about a pixel and a half.
+pub(in crate::offline) fn alike(p: &Ellipse2, q: &Ellipse2) -> bool {
+    let tolerance = 1.5;
+    if (p.centre - q.centre).norm() > tolerance || (p.a - q.a).abs() > tolerance || (p.b - q.b).abs() > tolerance {
+        return false;
+    }
+    (p.a - p.b) * (p.theta - q.theta).sin().abs() < tolerance
+}

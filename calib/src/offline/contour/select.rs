@@ -1,0 +1,300 @@
+//! From what the operator selected to the contours that may be meant.
+//!
+//! A click near a painted line means one of its two edges, and nobody knows which; the other view decides. So a selection gives a few contours, the
+//! likeliest first, each through edges next to the click, and the pair that is the picture of one rim is taken (see [`crate::offline::pairs::pairing`]).
+
+use crate::offline::contour::{Contour, LEAST_COVERAGE, Trial, ViewEdges, alike};
+use graspd_rt::geom::{Pixel, View};
+
+/// What was selected in one view, raw pixels.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Selection {
+    /// A click near the contour.
+    Click(Pixel),
+    /// Several points on the contour.
+    Points(Vec<Pixel>),
+    /// Two opposite corners of a box round the contour.
+    Box(Pixel, Pixel),
+}
+
+impl Selection {
+    /// Its kind, as the plan file names it.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Click(_) => "click",
+            Self::Points(_) => "points",
+            Self::Box(..) => "box",
+        }
+    }
+
+    /// Its pixels.
+    pub fn pixels(&self) -> Vec<Pixel> {
+        match self {
+            Self::Click(p) => vec![*p],
+            Self::Points(p) => p.clone(),
+            Self::Box(a, b) => vec![*a, *b],
+        }
+    }
+}
+
+/// Why a selection leads to no contour.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum SelectError {
+    /// A pixel outside the picture.
+    #[error("the {} selection ({:.1}, {:.1}) lies outside the {width}x{height} picture: click inside it", name(.view), at.x, at.y)]
+    Outside {
+        /// The view.
+        view: View,
+        /// The pixel.
+        at: Pixel,
+        /// Width of the picture.
+        width: usize,
+        /// Height of the picture.
+        height: usize,
+    },
+    /// No edge near the click.
+    #[error("there is no edge within {radius:.0} px of the {} click ({:.1}, {:.1}){}: click closer to the contour", name(.view), at.x, at.y, nearest_text(.nearest))]
+    NoEdge {
+        /// The view.
+        view: View,
+        /// The click.
+        at: Pixel,
+        /// How far was looked.
+        radius: f64,
+        /// The nearest edge that belongs to a line of edges, if any.
+        nearest: Option<Pixel>,
+    },
+    /// Edges, but no ellipse.
+    #[error("the edges near the {} selection ({:.1}, {:.1}) belong to no ellipse (the best one has edges on {percent:.0} % of its outline; at least {least:.0} % are needed, on one smooth line): click the rim itself, or several points on it", name(.view), at.x, at.y)]
+    NoEllipse {
+        /// The view.
+        view: View,
+        /// The click or the middle of the selection.
+        at: Pixel,
+        /// Coverage of the best ellipse, percent.
+        percent: f64,
+        /// What is needed, percent.
+        least: f64,
+    },
+    /// A box that holds nothing, or too few points.
+    #[error("the {} selection is empty: {fix}", name(.view))]
+    Empty {
+        /// The view.
+        view: View,
+        /// What to do.
+        fix: &'static str,
+    },
+}
+
+fn name(view: &View) -> &'static str {
+    match view {
+        View::Left => "left",
+        View::Right => "right",
+    }
+}
+
+fn nearest_text(p: &Option<Pixel>) -> String {
+    p.map_or(String::new(), |p| format!(", the nearest is at ({:.0}, {:.0})", p.x, p.y))
+}
+
+/// A contour that may be meant, and how far from meant it is.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Candidate {
+    /// The contour.
+    pub contour: Contour,
+    /// Distance from the selection in pixels, plus what is missing of the outline and how it scatters; the smallest is the likeliest.
+    pub cost: f64,
+}
+
+/// How far from an edge a click may be: an operator's hand on a large picture.
+pub fn snap_radius(width: usize) -> f64 {
+    (0.01 * width as f64).clamp(8.0, 20.0)
+}
+
+/// Contours that a selection may mean, likeliest first, at most `keep`.
+pub fn contours(
+    view: View,
+    edges: &ViewEdges<'_>,
+    selection: &Selection,
+    keep: usize,
+) -> Result<Vec<Candidate>, SelectError> {
+    for p in selection.pixels() {
+        if !edges.picture.contains(p, 0.0) {
+            let (width, height) = (edges.picture.width(), edges.picture.height());
+            return Err(SelectError::Outside { view, at: p, width, height });
+        }
+    }
+    match selection {
+        Selection::Click(p) => click(view, edges, *p, keep),
+        Selection::Points(p) => points(view, edges, p, keep),
+        Selection::Box(a, b) => boxed(view, edges, *a, *b, keep),
+    }
+}
+
+/// What speaks against a contour being a rim, in pixels of click distance: a gappy outline, and edges that scatter about the ellipse.
+fn unlikely(c: &Contour) -> f64 {
+    let missing = 1.0 - c.coverage;
+    8.0 * missing * missing + 5.0 * c.rms_px.min(2.0)
+}
+
+/// One edge of each arc near a pixel, nearest first.
+fn seeds(edges: &ViewEdges<'_>, at: Pixel, radius: f64) -> Vec<(f64, usize)> {
+    let mut best: std::collections::BTreeMap<usize, (f64, usize)> = std::collections::BTreeMap::new();
+    for (k, e) in edges.map.near(at, radius.ceil() as i32) {
+        let d = (e.at - at).norm();
+        let Some(arc) = edges.arcs.of(k) else { continue };
+        let slot = best.entry(arc).or_insert((f64::INFINITY, 0));
+        if d <= radius && d < slot.0 {
+            *slot = (d, k);
+        }
+    }
+    let mut out: Vec<_> = best.into_values().filter(|s| s.0.is_finite()).collect();
+    out.sort_by(|a, b| a.0.total_cmp(&b.0));
+    out
+}
+
+fn click(view: View, edges: &ViewEdges<'_>, at: Pixel, keep: usize) -> Result<Vec<Candidate>, SelectError> {
+    let radius = snap_radius(edges.picture.width());
+    let seeds = seeds(edges, at, radius);
+    if seeds.is_empty() {
+        let nearest = edges
+            .map
+            .edges()
+            .iter()
+            .enumerate()
+            .filter(|(k, _)| edges.arcs.of(*k).is_some())
+            .map(|(_, e)| e.at)
+            .min_by(|p, q| (p - at).norm_squared().total_cmp(&(q - at).norm_squared()));
+        return Err(SelectError::NoEdge { view, at, radius, nearest });
+    }
+    let mut out: Vec<Candidate> = Vec::new();
+    let mut best = 0.0f64;
+    for (_, seed) in seeds.iter().take(6) {
+        for t in edges.trials(*seed, 3) {
+            best = best.max(t.coverage);
+            if let Some(contour) = edges.contour(&t) {
+                let cost = contour.distance(at) + unlikely(&contour);
+                push(&mut out, Candidate { contour, cost });
+            }
+        }
+    }
+    finish(view, at, best, out, keep)
+}
+
+fn points(view: View, edges: &ViewEdges<'_>, at: &[Pixel], keep: usize) -> Result<Vec<Candidate>, SelectError> {
+    let Some(first) = at.first() else {
+        return Err(SelectError::Empty { view, fix: "give at least one point on the contour" });
+    };
+    let radius = snap_radius(edges.picture.width());
+    let mut out: Vec<Candidate> = Vec::new();
+    let (mut best, mut any) = (0.0f64, false);
+    for p in at.iter().take(32) {
+        for (_, seed) in seeds(edges, *p, radius).iter().take(2) {
+            any = true;
+            for t in edges.trials(*seed, 2) {
+                best = best.max(t.coverage);
+                // Most of the points have to lie on it: one slip of the hand is forgiven, a different contour is not.
+                let far = |t: &Trial| {
+                    let w = crate::offline::contour::quick_fit::Walk::new(&t.ellipse);
+                    let mut d: Vec<f64> = at
+                        .iter()
+                        .map(|p| edges.lens.ideal(*p).map_or(f64::INFINITY, |i| w.measure(i).0.abs()))
+                        .collect();
+                    d.sort_by(f64::total_cmp);
+                    d.get((3 * d.len() / 4).min(d.len() - 1)).copied().unwrap_or(f64::INFINITY)
+                };
+                let d = far(&t);
+                if d > radius {
+                    continue;
+                }
+                if let Some(contour) = edges.contour(&t) {
+                    let cost = d + unlikely(&contour);
+                    push(&mut out, Candidate { contour, cost });
+                }
+            }
+        }
+    }
+    if !any {
+        return Err(SelectError::NoEdge { view, at: *first, radius, nearest: None });
+    }
+    let middle = at.iter().sum::<Pixel>() / at.len() as f64;
+    finish(view, middle, best, out, keep)
+}
+
+fn boxed(view: View, edges: &ViewEdges<'_>, a: Pixel, b: Pixel, keep: usize) -> Result<Vec<Candidate>, SelectError> {
+    let (lo, hi) = (a.inf(&b), a.sup(&b));
+    let middle = (lo + hi) * 0.5;
+    if (hi - lo).min() < 8.0 {
+        return Err(SelectError::Empty { view, fix: "draw a box of at least 8 px round the contour" });
+    }
+    let inside = |p: Pixel| p.x >= lo.x - 3.0 && p.y >= lo.y - 3.0 && p.x <= hi.x + 3.0 && p.y <= hi.y + 3.0;
+    let mut arcs: Vec<_> = edges
+        .arcs
+        .arcs
+        .iter()
+        .filter(|a| a.edges.iter().step_by(4).filter_map(|k| edges.map.edges().get(*k as usize)).all(|e| inside(e.at)))
+        .collect();
+    arcs.sort_by_key(|a| std::cmp::Reverse(a.edges.len()));
+    let mut out: Vec<Candidate> = Vec::new();
+    let mut best = 0.0f64;
+    for arc in arcs.iter().take(40) {
+        let Some(seed) = arc.edges.get(arc.edges.len() / 2) else { continue };
+        if let Some(p) = edges.map.edges().get(*seed as usize).and_then(|e| edges.lens.ideal(e.at)) {
+            // Most seeds lie on a contour that is already known.
+            if out
+                .iter()
+                .any(|c| crate::offline::contour::quick_fit::Walk::new(&c.contour.ellipse).measure(p).0.abs() < 1.0)
+            {
+                continue;
+            }
+        }
+        for t in edges.trials(*seed as usize, 1) {
+            best = best.max(t.coverage);
+            let Some(contour) = edges.contour(&t) else { continue };
+            let (mut l, mut h) = (Pixel::repeat(f64::INFINITY), Pixel::repeat(f64::NEG_INFINITY));
+            let w = crate::offline::contour::quick_fit::Walk::new(&contour.ellipse);
+            for t in w.parameters(4.0, 400) {
+                let p = edges.lens.raw(w.at(t).0);
+                l = l.inf(&p);
+                h = h.sup(&p);
+            }
+            if !(inside(l) && inside(h)) {
+                continue;
+            }
+            // The largest contour that fills the box is meant.
+            let gap = (l - lo).abs().max().max((hi - h).abs().max());
+            let cost = gap + unlikely(&contour);
+            push(&mut out, Candidate { contour, cost });
+        }
+    }
+    if arcs.is_empty() {
+        return Err(SelectError::Empty { view, fix: "there are no edges in the box; draw it round the contour" });
+    }
+    finish(view, middle, best, out, keep)
+}
+
+fn push(out: &mut Vec<Candidate>, c: Candidate) {
+    match out
+        .iter_mut()
+        .find(|o| alike(&o.contour.ellipse, &c.contour.ellipse) && o.contour.bright_inside == c.contour.bright_inside)
+    {
+        Some(o) if o.cost <= c.cost => {}
+        Some(o) => *o = c,
+        None => out.push(c),
+    }
+}
+
+fn finish(
+    view: View,
+    at: Pixel,
+    best: f64,
+    mut out: Vec<Candidate>,
+    keep: usize,
+) -> Result<Vec<Candidate>, SelectError> {
+    if out.is_empty() {
+        return Err(SelectError::NoEllipse { view, at, percent: 100.0 * best, least: 100.0 * LEAST_COVERAGE });
+    }
+    out.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+    out.truncate(keep);
+    Ok(out)
+}

@@ -1,0 +1,216 @@
+//! Edge points linked to chains, and chains cut into arcs that could belong to one ellipse.
+
+use crate::offline::edges::EdgeMap;
+use crate::offline::edges::lens::Lens;
+use graspd_rt::geom::Pixel;
+
+/// Arcs shorter than this say nothing.
+const SHORTEST: usize = 8;
+
+/// A run of linked edge points that turns one way without corners.
+#[derive(Clone, Debug)]
+pub struct Arc {
+    /// Indices into the edge map, in order, brighter side always on the same hand.
+    pub edges: Vec<u32>,
+    /// How far it turns from end to end, radians, signed.
+    pub turn: f64,
+}
+
+/// An edge point in ideal pixels.
+#[derive(Clone, Copy, Debug)]
+pub struct IdealEdge {
+    /// Place with the lens distortion removed.
+    pub at: Pixel,
+    /// Unit gradient there, towards the brighter side.
+    pub towards_bright: Pixel,
+}
+
+/// The arcs of a picture.
+#[derive(Clone, Debug)]
+pub struct Arcs {
+    /// All arcs, in raster order of their first point.
+    pub arcs: Vec<Arc>,
+    /// Arc of each edge point, as index + 1; 0 for none.
+    arc_of: Vec<u32>,
+    /// Every edge point in ideal pixels; points where the lens has no inverse stand at NaN.
+    pub ideal: Vec<IdealEdge>,
+}
+
+impl Arcs {
+    /// Links and cuts the edge points of a picture.
+    pub fn link(map: &EdgeMap, lens: &Lens) -> Self {
+        let (next, previous) = links(map);
+        let n = map.edges().len();
+        let ideal = map
+            .edges()
+            .iter()
+            .map(|e| {
+                let at = lens.ideal(e.at).unwrap_or(Pixel::new(f64::NAN, f64::NAN));
+                IdealEdge { at, towards_bright: lens.ideal_direction(e.at, at, e.towards_bright) }
+            })
+            .collect();
+        let mut out = Self { arcs: Vec::new(), arc_of: vec![0; n], ideal };
+        let get = |v: &[u32], k: u32| v.get(k as usize).copied().unwrap_or(NONE);
+        let mut done = vec![false; n];
+        for start in 0..n as u32 {
+            if done.get(start as usize).copied().unwrap_or(true) {
+                continue;
+            }
+            // Back to the chain's beginning, or once round.
+            let mut first = start;
+            for _ in 0..n {
+                match get(&previous, first) {
+                    NONE => break,
+                    p if p == start => break,
+                    p => first = p,
+                }
+            }
+            let mut chain = Vec::new();
+            let mut k = first;
+            while k != NONE {
+                match done.get_mut(k as usize) {
+                    Some(d) if !*d => *d = true,
+                    _ => break,
+                }
+                chain.push(k);
+                k = get(&next, k);
+            }
+            out.cut(map, &chain);
+        }
+        out
+    }
+
+    /// The arc that an edge point belongs to.
+    pub fn of(&self, edge: usize) -> Option<usize> {
+        match self.arc_of.get(edge) {
+            Some(&k) if k > 0 => Some(k as usize - 1),
+            _ => None,
+        }
+    }
+
+    /// Cuts a chain at corners and inflections and keeps what is long enough.
+    fn cut(&mut self, map: &EdgeMap, chain: &[u32]) {
+        const W: usize = 5;
+        if chain.len() < SHORTEST {
+            return;
+        }
+        let dir: Vec<Pixel> =
+            chain.iter().filter_map(|k| map.edges().get(*k as usize)).map(|e| e.towards_bright).collect();
+        let turn = |i: usize, j: usize| match (dir.get(i), dir.get(j)) {
+            (Some(a), Some(b)) => (a.x * b.y - a.y * b.x).atan2(a.dot(b)),
+            _ => 0.0,
+        };
+        let mut from = 0;
+        let (mut sense, mut since) = (0.0f64, 0usize);
+        for k in 0..chain.len() {
+            let t = turn(k.saturating_sub(W), (k + W).min(chain.len() - 1));
+            let corner = t.abs() > 1.1;
+            let flips = t.abs() > 0.12 && sense * t < 0.0;
+            if corner || flips {
+                // An inflection lies between the last place that turned the old way and here.
+                let end = if corner { k } else { (since + k) / 2 };
+                self.keep(map, chain.get(from..end).unwrap_or(&[]));
+                from = if corner { k + 1 } else { end };
+                sense = 0.0;
+            }
+            if t.abs() > 0.12 && !corner {
+                sense = t;
+                since = k;
+            }
+        }
+        self.keep(map, chain.get(from..).unwrap_or(&[]));
+    }
+
+    fn keep(&mut self, map: &EdgeMap, piece: &[u32]) {
+        if piece.len() < SHORTEST {
+            return;
+        }
+        let dirs = piece.iter().filter_map(|k| map.edges().get(*k as usize)).map(|e| e.towards_bright);
+        let mut turn = 0.0;
+        let mut last: Option<Pixel> = None;
+        for d in dirs.step_by(4) {
+            if let Some(l) = last {
+                turn += (l.x * d.y - l.y * d.x).atan2(l.dot(&d));
+            }
+            last = Some(d);
+        }
+        self.arcs.push(Arc { edges: piece.to_vec(), turn });
+        let id = u32::try_from(self.arcs.len()).unwrap_or(0);
+        for k in piece {
+            if let Some(a) = self.arc_of.get_mut(*k as usize) {
+                *a = id;
+            }
+        }
+    }
+}
+
+const NONE: u32 = u32::MAX;
+
+/// Next and previous edge point of each, where the choice is mutual.
+fn links(map: &EdgeMap) -> (Vec<u32>, Vec<u32>) {
+    let n = map.edges().len();
+    let (mut ahead, mut behind) = (vec![NONE; n], vec![NONE; n]);
+    for (i, e) in map.edges().iter().enumerate() {
+        let t = Pixel::new(-e.towards_bright.y, e.towards_bright.x);
+        let (mut best_a, mut best_b) = (f64::INFINITY, f64::INFINITY);
+        for (j, f) in map.near(e.at, 2) {
+            if j == i || e.towards_bright.dot(&f.towards_bright) < 0.7 {
+                continue;
+            }
+            let d = f.at - e.at;
+            let along = d.dot(&t);
+            let aside = d.dot(&e.towards_bright).abs();
+            if aside > 0.6 * along.abs() + 0.3 || along.abs() < 0.2 {
+                continue;
+            }
+            let cost = along.abs() + 2.0 * aside;
+            let (best, slot) = if along > 0.0 { (&mut best_a, &mut ahead) } else { (&mut best_b, &mut behind) };
+            if cost < *best {
+                *best = cost;
+                if let (Some(s), Ok(j)) = (slot.get_mut(i), u32::try_from(j)) {
+                    *s = j;
+                }
+            }
+        }
+    }
+    let mutual = |to: &[u32], back: &[u32]| -> Vec<u32> {
+        to.iter()
+            .enumerate()
+            .map(|(i, &j)| if j != NONE && back.get(j as usize).copied() == u32::try_from(i).ok() { j } else { NONE })
+            .collect()
+    };
+    (mutual(&ahead, &behind), mutual(&behind, &ahead))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::offline::edges::EdgeMap;
+    use crate::offline::edges::picture::Picture;
+    use graspd_rt::geom::{Camera, Distortion};
+
+    #[test]
+    fn a_disc_gives_one_arc_all_round_and_a_square_four() {
+        let cam = Camera {
+            width: 160,
+            height: 160,
+            fx: 200.0,
+            fy: 200.0,
+            cx: 80.0,
+            cy: 80.0,
+            distortion: Distortion::default(),
+        };
+        let draw = |f: &dyn Fn(f64, f64) -> f64| {
+            let data = (0..160 * 160)
+                .map(|i| (60.0 + 100.0 / (1.0 + (-2.0 * f((i % 160) as f64, (i / 160) as f64)).exp())) as u8)
+                .collect();
+            let map = EdgeMap::detect(&Picture::new(160, 160, data).unwrap());
+            Arcs::link(&map, &Lens::new(&cam))
+        };
+        let disc = draw(&|x, y| 50.0 - (x - 80.0).hypot(y - 79.0));
+        let total: f64 = disc.arcs.iter().map(|a| a.turn.abs()).sum();
+        assert!(disc.arcs.len() <= 2 && (total - std::f64::consts::TAU).abs() < 0.4, "{} {total}", disc.arcs.len());
+        let square = draw(&|x, y| 40.0 - (x - 80.0).abs().max((y - 80.0).abs()));
+        assert_eq!(square.arcs.iter().filter(|a| a.edges.len() > 50).count(), 4);
+    }
+}

@@ -1,0 +1,106 @@
+//! Ellipses proposed without a click: found in each view, paired by the two-view condition, ranked.
+
+use crate::offline::contour::quick_fit::Walk;
+use crate::offline::contour::select::Candidate;
+use crate::offline::contour::{Contour, ViewEdges};
+use crate::offline::rim::model::{Options, Outline, Projection, Reconstruction, RimChoice};
+use crate::offline::rim::reconstruct::reconstruct;
+
+/// A rim proposed to the operator.
+#[derive(Clone, Debug)]
+pub struct Proposal {
+    /// Its contours, left and right.
+    pub contours: [Contour; 2],
+    /// The plane rim that they are a picture of.
+    pub reconstruction: Reconstruction,
+    /// By which proposals are ranked: complete, large and consistent first.
+    pub score: f64,
+}
+
+impl Proposal {
+    /// Its contours as candidates for planning.
+    pub fn candidates(&self) -> [Vec<Candidate>; 2] {
+        self.contours.clone().map(|contour| vec![Candidate { contour, cost: 0.0 }])
+    }
+}
+
+/// Seeds tried in a view: arcs that turn, longest first.
+const SEEDS: usize = 120;
+/// Ellipses kept of a view.
+const KEPT: usize = 40;
+
+/// Every ellipse worth mentioning in one view, best first.
+pub fn ellipses(edges: &ViewEdges<'_>) -> Vec<Contour> {
+    let mut seeds: Vec<_> = edges.arcs.arcs.iter().filter(|a| a.turn.abs() > 0.35 && a.edges.len() >= 16).collect();
+    seeds.sort_by(|a, b| (b.turn.abs() * b.edges.len() as f64).total_cmp(&(a.turn.abs() * a.edges.len() as f64)));
+    let mut out: Vec<Contour> = Vec::new();
+    for arc in seeds.into_iter().take(SEEDS) {
+        let Some(seed) = arc.edges.get(arc.edges.len() / 2) else { continue };
+        let Some(at) = edges.arcs.ideal.get(*seed as usize) else { continue };
+        // An arc that lies on an ellipse already found says nothing new.
+        let known = out.iter().any(|c| {
+            let (d, n, _) = Walk::new(&c.ellipse).measure(at.at);
+            let sign = if c.bright_inside { -1.0 } else { 1.0 };
+            d.abs() < 1.5 && at.towards_bright.dot(&n) * sign > 0.9
+        });
+        if known {
+            continue;
+        }
+        for t in edges.trials(*seed as usize, 1) {
+            if t.coverage < 0.5 {
+                continue;
+            }
+            if let Some(c) = edges.contour(&t).filter(|c| c.coverage > 0.5 && c.rms_px < 0.6 && c.points.len() >= 20) {
+                let new = !out.iter().any(|o| {
+                    crate::offline::contour::alike(&o.ellipse, &c.ellipse) && o.bright_inside == c.bright_inside
+                });
+                if new {
+                    out.push(c);
+                }
+            }
+        }
+    }
+    out.sort_by(|a, b| worth(b).total_cmp(&worth(a)));
+    out.truncate(KEPT);
+    out
+}
+
+fn worth(c: &Contour) -> f64 {
+    c.coverage * c.coverage * (c.points.len() as f64).sqrt() / (0.15 + c.rms_px)
+}
+
+/// Pairs the ellipses of both views that reconstruct to a rim, best first, at most `most`.
+pub fn propose(views: &[ViewEdges<'_>; 2], p: [&Projection; 2], options: &Options, most: usize) -> Vec<Proposal> {
+    let options =
+        Options { rim: if options.rim == RimChoice::RoundBar { RimChoice::Edge } else { options.rim }, ..*options };
+    let [left, right] = [ellipses(&views[0]), ellipses(&views[1])];
+    let mut found: Vec<(f64, usize, usize, Reconstruction)> = Vec::new();
+    for (i, l) in left.iter().enumerate() {
+        let a = l.edge_points(Outline::Outer);
+        for (j, r) in right.iter().enumerate() {
+            let ratio = l.ellipse.a / r.ellipse.a;
+            if l.bright_inside != r.bright_inside || !(0.5..2.0).contains(&ratio) {
+                continue;
+            }
+            if let Ok(rec) = reconstruct(&a, p[0], &r.edge_points(Outline::Outer), p[1], &options) {
+                let gap = rec.report.gap_px.iter().filter(|g| g.is_finite()).map(|g| g.abs()).fold(0.0, f64::max);
+                found.push(((worth(l) * worth(r)).sqrt() / (0.3 + gap), i, j, rec));
+            }
+        }
+    }
+    // The best pair first; each ellipse is the picture of one rim only.
+    found.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let (mut used_left, mut used_right) = (vec![false; left.len()], vec![false; right.len()]);
+    let mut out = Vec::new();
+    for (score, i, j, reconstruction) in found {
+        let (Some(ul), Some(ur)) = (used_left.get_mut(i), used_right.get_mut(j)) else { continue };
+        if *ul || *ur || out.len() >= most {
+            continue;
+        }
+        (*ul, *ur) = (true, true);
+        if let (Some(l), Some(r)) = (left.get(i), right.get(j)) {
+            out.push(Proposal { contours: [l.clone(), r.clone()], reconstruction, score });
+        }
+    }
+    out
+}

@@ -1,0 +1,264 @@
+//! The values that go into and come out of a reconstruction: edge points, rim models, options, result and report.
+//!
+//! The entry is [`crate::offline::rim::reconstruct::reconstruct`]:
+//!
+//! ```text
+//! fn reconstruct(left: &[EdgePoint], p_left: &Projection, right: &[EdgePoint], p_right: &Projection, options: &Options)
+//!     -> Result<Reconstruction, Refusal>
+//! ```
+//!
+//! Lengths are in whatever unit the projection matrices use (metres in graspd, millimetres in the golden cases).
+
+use nalgebra::{Matrix2, Matrix3, Matrix3x2, Matrix3x4, Vector2, Vector3};
+
+/// A finite camera, `u = P x` (paper equation 1): pixels free of distortion from homogeneous points. Scale and sign do not matter.
+pub type Projection = Matrix3x4<f64>;
+
+/// Which outline of a rim an edge point belongs to.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum Outline {
+    /// The only outline of a sharp or painted edge, or the outer one of a bar.
+    #[default]
+    Outer,
+    /// The inner outline of a round bar.
+    Inner,
+}
+
+/// An edge point: pixels of an ideal pinhole (distortion removed) and its standard deviation across the edge.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EdgePoint {
+    /// Undistorted pixel.
+    pub uv: Vector2<f64>,
+    /// Standard deviation across the edge, pixels. Only the ratios matter unless [`Noise::AtLeastGiven`] is chosen.
+    pub sigma: f64,
+    /// The outline it lies on.
+    pub outline: Outline,
+}
+
+impl EdgePoint {
+    /// A point on the (outer) outline.
+    pub fn new(u: f64, v: f64, sigma: f64) -> Self {
+        Self { uv: Vector2::new(u, v), sigma, outline: Outline::Outer }
+    }
+
+    /// A point on the inner outline of a round bar.
+    pub fn inner(u: f64, v: f64, sigma: f64) -> Self {
+        Self { uv: Vector2::new(u, v), sigma, outline: Outline::Inner }
+    }
+}
+
+/// What the rim is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum RimModel {
+    /// A sharp or painted circle (6 parameters).
+    Circle,
+    /// A sharp or painted ellipse (8 parameters).
+    Ellipse,
+    /// A round bar bent to a circle, a torus (7 parameters, 6 when the bar's diameter is known).
+    RoundBar,
+}
+
+/// What the operator says that the rim is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum RimChoice {
+    /// A plane edge: circle or ellipse by the information criterion.
+    Edge,
+    /// A plane circle.
+    Circle,
+    /// A plane ellipse.
+    Ellipse,
+    /// A round bar.
+    RoundBar,
+    /// Anything: the smallest information criterion decides.
+    #[default]
+    Auto,
+}
+
+/// Where the absolute scale of the noise comes from.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum Noise {
+    /// From the residuals of the fit alone; `EdgePoint::sigma` gives relative weights.
+    #[default]
+    FromFit,
+    /// From the residuals, but never below what `EdgePoint::sigma` says.
+    AtLeastGiven,
+}
+
+/// In which direction edge points scatter about the contour. The difference is `kappa sigma^2 / 2`, below 0.003 px on ordinary edges.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum Scatter {
+    /// Equally in all directions: first-order distances have no bias.
+    #[default]
+    Isotropic,
+    /// Across the edge only, as an edge detector's sub-pixel step along the gradient does: orthogonal distances have no bias.
+    Across,
+}
+
+/// What to assume and what to tolerate.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Options {
+    /// The rim's kind.
+    pub rim: RimChoice,
+    /// The bar's diameter when the operator knows it, length units. Makes the outer outlines alone enough for a round bar.
+    pub bar_diameter: Option<f64>,
+    /// Scale of the noise.
+    pub noise: Noise,
+    /// Direction of the noise.
+    pub scatter: Scatter,
+    /// Whether to look for gross outliers: consensus in each view, then a redescending loss over both.
+    pub robust: bool,
+    /// The gate of the two-view test, in standard deviations.
+    pub gate_sigmas: f64,
+    /// Allowance for the rig's calibration error in the two-view test, pixels (0: trust the rig fully). A real rig needs 0.3 to 1.
+    pub calibration_px: f64,
+    /// Systematic error that edge points share along a contour, pixels (0: none, as for points without a picture). Detected edges
+    /// have 0.05 to 0.1; an ellipse that it could have made of a circle is taken for a circle.
+    pub edge_bias_px: f64,
+    /// Largest residual standard deviation that edge points may show, pixels.
+    pub max_noise_px: f64,
+    /// Smallest acceptable semi-minor axis of a rim's picture, pixels (errata C1).
+    pub min_minor_axis_px: f64,
+    /// Largest acceptable standard deviation of the centre (length units); `None`: a tenth of the rim's radius.
+    pub max_sigma_centre: Option<f64>,
+    /// Largest acceptable standard deviation of the normal, radians (errata C2: 2 degrees).
+    pub max_sigma_normal: f64,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            rim: RimChoice::Auto,
+            bar_diameter: None,
+            noise: Noise::FromFit,
+            scatter: Scatter::Isotropic,
+            robust: true,
+            gate_sigmas: 4.0,
+            calibration_px: 0.0,
+            edge_bias_px: 0.0,
+            max_noise_px: 3.0,
+            min_minor_axis_px: 3.0,
+            max_sigma_centre: None,
+            max_sigma_normal: 2.0_f64.to_radians(),
+        }
+    }
+}
+
+/// An ellipse in a picture or in a plane: centre, semi-axes `a >= b > 0`, direction of `a` in `[0, pi)` from x towards y.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ellipse2 {
+    /// Centre.
+    pub centre: Vector2<f64>,
+    /// Semi-major axis.
+    pub a: f64,
+    /// Semi-minor axis.
+    pub b: f64,
+    /// Direction of the major axis, radians.
+    pub theta: f64,
+}
+
+/// A rim in space as a value: an ellipse, circle or the core circle of a bar.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rim {
+    /// Centre in the frame of the projection matrices.
+    pub centre: Vector3<f64>,
+    /// Unit normal of its plane, towards the cameras.
+    pub normal: Vector3<f64>,
+    /// Semi-major axis; radius of a circle; core radius of a bar.
+    pub a: f64,
+    /// Semi-minor axis.
+    pub b: f64,
+    /// Unit direction of the major axis, its largest component positive. Arbitrary for a circle.
+    pub axis_a: Vector3<f64>,
+    /// `normal x axis_a`.
+    pub axis_b: Vector3<f64>,
+}
+
+/// What a model explains, for the information criterion.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Score {
+    /// The model.
+    pub model: RimModel,
+    /// Weighted sum of squared residuals (pixels squared when all sigmas are 1).
+    pub chi2: f64,
+    /// Number of parameters.
+    pub parameters: usize,
+    /// Bayesian information criterion relative to the noise of the best model; the smallest wins.
+    pub bic: f64,
+    /// Why the model is out of the question although it was tried, in words.
+    pub excluded: Option<&'static str>,
+}
+
+/// How well the geometry determines the answer (errata C).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Report {
+    /// Square root of the trace of the centre's covariance, length units.
+    pub sigma_centre: f64,
+    /// Square root of the trace of the normal's covariance, radians.
+    pub sigma_normal: f64,
+    /// Semi-minor axes of the rim's pictures, left and right, pixels.
+    pub minor_axis_px: [f64; 2],
+    /// Angle between the two viewing rays of the centre, radians.
+    pub vergence: f64,
+    /// Largest eigenvalue that should be zero over the smaller of the two others (paper's route; 0 is perfect).
+    pub rank2: f64,
+    /// Smaller over larger of the two non-zero eigenvalues.
+    pub separation: f64,
+    /// Scale-free form of the paper's condition (equation 4): `1 - 4 I1 I3 / I2^2`.
+    pub delta: f64,
+    /// Epipolar tangency gaps in the right picture, pixels; NaN when the epipole lies inside the ellipse.
+    pub gap_px: [f64; 2],
+    /// Predicted standard deviation of the gaps from the two fits, pixels.
+    pub gap_sigma_px: [f64; 2],
+    /// Excess of the two-view fit over the two one-view fits in units of the noise variance: chi-squared with 2 degrees of freedom for a match.
+    pub excess: f64,
+    /// Angle between the planes of the paper's route and of the camera-symmetric closed form, radians.
+    pub routes_differ: f64,
+    /// Weighted sum of squared residuals of the chosen model.
+    pub chi2: f64,
+    /// Its degrees of freedom.
+    pub dof: usize,
+    /// Noise standard deviation used in the covariances, in units of `EdgePoint::sigma`.
+    pub noise: f64,
+    /// Every model that was tried.
+    pub scores: Vec<Score>,
+    /// Fitted ellipses in the pictures (of the outer outlines), left and right.
+    pub image_ellipse: [Ellipse2; 2],
+    /// Residual of every input point against the chosen model, pixels, positive outside; in the order given.
+    pub residuals: [Vec<f64>; 2],
+    /// Whether each input point was used.
+    pub inliers: [Vec<bool>; 2],
+}
+
+/// A rim in space with its uncertainty.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Reconstruction {
+    /// The model that was chosen.
+    pub model: RimModel,
+    /// The rim itself; for a round bar its core circle.
+    pub rim: Rim,
+    /// Radius of the bar, for a round bar.
+    pub bar_radius: Option<f64>,
+    /// Covariance of the centre, length units squared.
+    pub cov_centre: Matrix3<f64>,
+    /// Covariance of the normal, radians squared, in the columns `e1, e2` of [`crate::offline::rim::circle::frame_of`] the normal.
+    pub cov_normal: Matrix2<f64>,
+    /// Covariance of the centre (rows) against the normal (columns `e1, e2`).
+    pub cov_centre_normal: Matrix3x2<f64>,
+    /// Covariance of `(a, b)`; of `(R, r)` for a round bar.
+    pub cov_axes: Matrix2<f64>,
+    /// Figures by which to judge it.
+    pub report: Report,
+}
+
+impl Reconstruction {
+    /// Half the width that a gripper has to span along the major and minor axis: the bar's radius counts.
+    pub fn half_widths(&self) -> (f64, f64) {
+        let r = self.bar_radius.unwrap_or(0.0);
+        (self.rim.a + r, self.rim.b + r)
+    }
+
+    /// Whether the rim has no preferred direction, so that the grasp has a free angle about the axis.
+    pub fn is_round(&self) -> bool {
+        !matches!(self.model, RimModel::Ellipse)
+    }
+}

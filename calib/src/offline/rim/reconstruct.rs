@@ -1,0 +1,298 @@
+//! From edge points in two views to a rim in space: the chain of section 4, refined, with the model chosen and the doubts spelt out.
+
+use crate::offline::bar::{bar_result, fit_bar};
+use crate::offline::conic::robust::GATE;
+use crate::offline::conic::sampson::distance;
+use crate::offline::rim::circle::vergence;
+use crate::offline::rim::ml::{MlFit, image_conic};
+use crate::offline::rim::model::{
+    EdgePoint, Noise, Options, Outline, Projection, Reconstruction, Report, RimChoice, RimModel, Score,
+};
+use crate::offline::rim::planar::{Analysis, analyse};
+use crate::offline::rim::refusal::Refusal;
+
+/// Limit of the centre's standard deviation as a fraction of the radius when the task states none.
+const CENTRE_FRACTION: f64 = 0.1;
+
+/// Reconstructs a rim from the edge points of both views.
+///
+/// Points are pixels without distortion; matrices in any length unit and frame, of any scale and sign. Points of the inner outline
+/// matter to the round-bar model only.
+///
+/// # Errors
+/// A [`Refusal`] that says what is wrong and what to change. Never panics, whatever the input.
+pub fn reconstruct(
+    left: &[EdgePoint],
+    p_left: &Projection,
+    right: &[EdgePoint],
+    p_right: &Projection,
+    options: &Options,
+) -> Result<Reconstruction, Refusal> {
+    let outer = [left, right].map(|v| v.iter().filter(|p| p.outline == Outline::Outer).copied().collect::<Vec<_>>());
+    let p = [p_left, p_right];
+    let analysis = analyse([&outer[0], &outer[1]], p, options)?;
+    let points = [left, right];
+    match options.rim {
+        RimChoice::Edge | RimChoice::Circle | RimChoice::Ellipse => plane(&analysis, points, p, options),
+        RimChoice::RoundBar => {
+            let bar = fit_bar(points, p, &analysis, options)?;
+            let scores = vec![score(RimModel::RoundBar, bar.fit.chi2, bar.fit.parameters, bar.count, bar.noise)];
+            bar_result(&bar, scores, &analysis, points, p, options)
+        }
+        RimChoice::Auto => any_model(&analysis, points, p, options),
+    }
+}
+
+/// The plane models alone.
+fn plane(
+    a: &Analysis,
+    points: [&[EdgePoint]; 2],
+    p: [&Projection; 2],
+    options: &Options,
+) -> Result<Reconstruction, Refusal> {
+    a.verdict.clone()?;
+    let (fit, scores) = choose_plane_model(a, options.rim, options)?;
+    Ok(plane_result(a, &fit, scores, points, p, options))
+}
+
+/// Plane edge or round bar, by the information criterion over the same points.
+fn any_model(
+    a: &Analysis,
+    points: [&[EdgePoint]; 2],
+    p: [&Projection; 2],
+    options: &Options,
+) -> Result<Reconstruction, Refusal> {
+    let inner = points.map(|v| v.iter().filter(|q| q.outline == Outline::Inner).copied().collect::<Vec<_>>());
+    let both = inner.iter().all(|v| v.len() >= 10);
+    let flat = plane(a, points, p, options);
+    // One outline without the bar's diameter: a bar would only add a parameter that it cannot determine, and with it the freedom to
+    // explain two contours that are no pair.
+    if !both && options.bar_diameter.is_none() {
+        return flat;
+    }
+    let bar = match fit_bar(points, p, a, options) {
+        Ok(bar) => bar,
+        Err(e) => return flat.map_err(|flat| if both { e } else { flat }),
+    };
+    let bar_scored = |noise: f64| {
+        let all: Vec<f64> = scaled(&bar.residuals, points, |_| true);
+        score(RimModel::RoundBar, truncated(&all, noise), bar.fit.parameters, all.len(), noise)
+    };
+    let Ok(flat) = flat else {
+        let result = bar_result(&bar, vec![bar_scored(bar.noise)], a, points, p, options);
+        // Neither: the plane's words are about the contours, the bar's only matter where it fits the points.
+        return match (flat, result) {
+            (_, Ok(r)) => Ok(r),
+            (_, Err(e @ Refusal::BarUndetermined { .. })) => Err(e),
+            (Err(e), Err(b)) => Err(if both { b } else { e }),
+            (Ok(r), Err(_)) => Ok(r),
+        };
+    };
+    // The hole of a flat ring is a rim of its own, with as many parameters again.
+    let hole = if both { analyse([&inner[0], &inner[1]], p, options).ok() } else { None };
+    let hole_fit = hole.as_ref().and_then(|h| choose_plane_model(h, RimChoice::Edge, options).ok());
+    let own = scaled(&flat.report.residuals, points, |o| o == Outline::Outer);
+    let parameters = |m: RimModel| if m == RimModel::Circle { 6 } else { 8 };
+    let (mut rest, mut more) = (own, parameters(flat.model));
+    if both {
+        match &hole_fit {
+            Some((f, _)) => {
+                more += f.parameters;
+                for k in 0..2 {
+                    let conic = image_conic(p[k], &f.rim);
+                    rest.extend(inner[k].iter().map(|q| distance(&conic, &q.uv) / q.sigma));
+                }
+            }
+            None => return bar_result(&bar, vec![bar_scored(bar.noise)], a, points, p, options),
+        }
+    }
+    let noise = bar.noise.min(flat.report.noise).max(1e-6);
+    let flat_score = score(flat.model, truncated(&rest, noise), more, rest.len(), noise);
+    let bar_score = bar_scored(noise);
+    let scores: Vec<Score> = flat.report.scores.iter().copied().chain([bar_score]).collect();
+    if bar_score.bic < flat_score.bic {
+        match bar_result(&bar, scores.clone(), a, points, p, options) {
+            Ok(r) => return Ok(r),
+            Err(e) if both => return Err(e),
+            Err(_) => {}
+        }
+    }
+    let mut flat = flat;
+    flat.report.scores = scores;
+    Ok(flat)
+}
+
+/// Residuals in units of sigma of the points whose outline is wanted.
+fn scaled(residuals: &[Vec<f64>; 2], points: [&[EdgePoint]; 2], wanted: impl Fn(Outline) -> bool) -> Vec<f64> {
+    let mut out = Vec::new();
+    for k in 0..2 {
+        out.extend(residuals[k].iter().zip(points[k]).filter(|(_, q)| wanted(q.outline)).map(|(r, q)| r / q.sigma));
+    }
+    out
+}
+
+/// Sum of squares with every residual cut off at the outlier gate, so that models with different outliers can be compared.
+fn truncated(r: &[f64], noise: f64) -> f64 {
+    let most = GATE * noise;
+    r.iter().map(|x| if x.is_finite() { (x * x).min(most * most) } else { most * most }).sum()
+}
+
+/// Chooses between circle and ellipse by the information criterion (or as told), and holds the winner against the task's tolerance.
+pub fn choose_plane_model(a: &Analysis, rim: RimChoice, options: &Options) -> Result<(MlFit, Vec<Score>), Refusal> {
+    let ellipse = a.ellipse.as_ref();
+    let circle = a.circle.as_ref();
+    // The noise that the richer model leaves is the yardstick for both.
+    let noise = ellipse.or(circle).map_or(1.0, |f| noise_of(f, a, options));
+    let mut scores: Vec<Score> =
+        [circle, ellipse].into_iter().flatten().map(|f| score(f.model, f.chi2, f.parameters, f.count, noise)).collect();
+    let fit = match (rim, circle, ellipse) {
+        (RimChoice::Circle, c, _) => c.map_err(Clone::clone)?,
+        (RimChoice::Ellipse, _, e) => e.map_err(Clone::clone)?,
+        (_, Ok(c), Ok(e)) => {
+            let bic = |m| scores.iter().find(|s| s.model == m).map_or(f64::INFINITY, |s| s.bic);
+            if bic(RimModel::Circle) <= bic(RimModel::Ellipse) {
+                c
+            } else if round_within_bias(e, a, options) {
+                for s in scores.iter_mut().filter(|s| s.model == RimModel::Ellipse) {
+                    s.excluded = Some("a circle within the edges' systematic error");
+                }
+                c
+            } else {
+                e
+            }
+        }
+        (_, Ok(c), Err(_)) => c,
+        (_, Err(_), e) => e.map_err(Clone::clone)?,
+    };
+    let noise = noise_of(fit, a, options);
+    tolerable(
+        fit.cov_centre(noise).trace().sqrt(),
+        fit.cov_normal(noise).trace().sqrt(),
+        fit.rim.a,
+        vergence(&fit.rim.centre, &a.centres),
+        fit.model,
+        options,
+    )?;
+    Ok((fit.clone(), scores))
+}
+
+/// Whether an ellipse is so nearly round that the edges' systematic error alone could have made it (errata D: a circle when `1 - b/a`
+/// is within three standard deviations of zero; detected edges carry an error that does not average out over their number).
+fn round_within_bias(e: &MlFit, a: &Analysis, options: &Options) -> bool {
+    let radius = a.fits.iter().map(|f| f.fit.ellipse.a).fold(f64::INFINITY, f64::min);
+    1.0 - e.rim.b / e.rim.a <= 3.0 * options.edge_bias_px / radius
+}
+
+/// Bayesian information criterion of a model for a given noise.
+pub(crate) fn score(model: RimModel, chi2: f64, parameters: usize, count: usize, noise: f64) -> Score {
+    let bic = chi2 / (noise * noise) + parameters as f64 * (count.max(1) as f64).ln();
+    Score { model, chi2, parameters, bic, excluded: None }
+}
+
+/// Noise of a fit: its residuals', but never below the given sigmas if so asked, nor below rounding.
+fn noise_of(fit: &MlFit, a: &Analysis, options: &Options) -> f64 {
+    match options.noise {
+        Noise::AtLeastGiven => fit.noise().max(1.0),
+        Noise::FromFit => fit.noise().max(1e-12 * a.noise),
+    }
+}
+
+/// Refuses a result that is less certain than the task allows, with the advice that fits the cause.
+pub(crate) fn tolerable(
+    sigma_centre: f64,
+    sigma_normal: f64,
+    radius: f64,
+    vergence: f64,
+    model: RimModel,
+    options: &Options,
+) -> Result<(), Refusal> {
+    let limit_centre = options.max_sigma_centre.unwrap_or(CENTRE_FRACTION * radius);
+    if sigma_centre <= limit_centre && sigma_normal <= options.max_sigma_normal {
+        return Ok(());
+    }
+    let advice = if vergence < 5.0_f64.to_radians() {
+        "the cameras see the rim from nearly the same direction: widen the baseline or move the rig closer"
+    } else if model == RimModel::Ellipse {
+        "click more of the rim, or say that it is a circle if it is one"
+    } else {
+        "click more of the rim, move the rig closer, or see it more from its face"
+    };
+    Err(Refusal::TooUncertain {
+        sigma_centre,
+        limit_centre,
+        sigma_normal_deg: sigma_normal.to_degrees(),
+        limit_normal_deg: options.max_sigma_normal.to_degrees(),
+        vergence_deg: vergence.to_degrees(),
+        advice,
+    })
+}
+
+/// The report's part that does not depend on the model.
+pub(crate) fn base_report(a: &Analysis, points: [&[EdgePoint]; 2]) -> Report {
+    let routes_differ = match (&a.paper, &a.polar) {
+        (Ok(x), Ok(y)) => x.rim.normal.cross(&y.rim.normal).norm().atan2(x.rim.normal.dot(&y.rim.normal)),
+        _ => f64::NAN,
+    };
+    let (rank2, separation) = a.paper.as_ref().map_or((f64::NAN, f64::NAN), |c| (c.pair.rank2, c.pair.separation));
+    Report {
+        sigma_centre: f64::NAN,
+        sigma_normal: f64::NAN,
+        minor_axis_px: [a.fits[0].fit.ellipse.b, a.fits[1].fit.ellipse.b],
+        vergence: f64::NAN,
+        rank2,
+        separation,
+        delta: a.pencil.delta(),
+        gap_px: a.gap_px,
+        gap_sigma_px: a.gap_sigma_px,
+        excess: a.excess,
+        routes_differ,
+        chi2: f64::NAN,
+        dof: 0,
+        noise: a.noise,
+        scores: Vec::new(),
+        image_ellipse: [a.fits[0].fit.ellipse, a.fits[1].fit.ellipse],
+        residuals: points.map(|v| vec![f64::NAN; v.len()]),
+        inliers: points.map(|v| vec![false; v.len()]),
+    }
+}
+
+/// The result of a plane model.
+fn plane_result(
+    a: &Analysis,
+    fit: &MlFit,
+    scores: Vec<Score>,
+    points: [&[EdgePoint]; 2],
+    p: [&Projection; 2],
+    options: &Options,
+) -> Reconstruction {
+    let noise = noise_of(fit, a, options);
+    let mut report = base_report(a, points);
+    for k in 0..2 {
+        let conic = image_conic(p[k], &fit.rim);
+        let mut used = a.fits[k].inliers.iter();
+        for (i, point) in points[k].iter().enumerate() {
+            report.residuals[k][i] = distance(&conic, &point.uv);
+            if point.outline == Outline::Outer {
+                report.inliers[k][i] = used.next().copied().unwrap_or(false);
+            }
+        }
+    }
+    let (cov_centre, cov_normal) = (fit.cov_centre(noise), fit.cov_normal(noise));
+    report.sigma_centre = cov_centre.trace().sqrt();
+    report.sigma_normal = cov_normal.trace().sqrt();
+    report.vergence = vergence(&fit.rim.centre, &a.centres);
+    report.chi2 = fit.chi2;
+    report.dof = fit.dof();
+    report.noise = noise;
+    report.scores = scores;
+    Reconstruction {
+        model: fit.model,
+        rim: fit.rim,
+        bar_radius: None,
+        cov_centre,
+        cov_normal,
+        cov_centre_normal: fit.cov_centre_normal(noise),
+        cov_axes: fit.cov_axes(noise),
+        report,
+    }
+}
