@@ -3,7 +3,11 @@
 //! Both outlines of both views determine everything at the level of a plane circle. The outer outlines alone confuse core and bar radius
 //! and tip the normal: then the bar's diameter has to be known, or the result is refused by its own covariance.
 
+pub(in crate::offline) mod found;
+pub(in crate::offline) mod limb;
+pub(in crate::offline) mod outlines;
 pub(in crate::offline) mod search;
+pub(in crate::offline) mod settle;
 pub mod torus;
 
 use crate::offline::bar::torus::{Free, Ray, Torus, TorusFit, fit, rays};

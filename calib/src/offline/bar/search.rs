@@ -4,26 +4,15 @@
 //! where the other outline has to be in both pictures. So thickness is tried from thin to thick, and each is judged by the edges there. Around the best ones
 //! all four outlines are followed along the curves that the bar predicts (an outline is no ellipse) and the bar is fitted to them, until it stands still.
 
-use crate::offline::bar::torus::{Free, Ray, Torus, fit, outline, rays};
-use crate::offline::contour::follow::{Place, STEP_PX, places};
+use crate::offline::bar::found::BarFound;
+use crate::offline::bar::outlines::{View, support};
+use crate::offline::bar::settle::settle;
+use crate::offline::bar::torus::{Free, Ray, Torus, fit, rays};
+use crate::offline::conic::robust::median;
 use crate::offline::contour::{Contour, ViewEdges};
-use crate::offline::rim::cone::{camera_centre, project};
-use crate::offline::rim::model::{EdgePoint, Options, Outline, Projection, Reconstruction, RimChoice, RimModel};
-use crate::offline::rim::reconstruct::reconstruct;
+use crate::offline::rim::cone::camera_centre;
+use crate::offline::rim::model::{EdgePoint, Options, Projection, Reconstruction};
 use nalgebra::Vector3;
-
-/// A bar and its outlines.
-#[derive(Clone, Debug)]
-pub(in crate::offline) struct BarFound {
-    /// Outer outlines, left and right.
-    pub(in crate::offline) outer: [Contour; 2],
-    /// Inner outlines, left and right.
-    pub(in crate::offline) inner: [Contour; 2],
-    /// Both outlines of both views as a round bar.
-    pub(in crate::offline) reconstruction: Reconstruction,
-    /// Support of the guess that led to it.
-    pub(in crate::offline) support: f64,
-}
 
 /// What a search found.
 #[derive(Clone, Debug)]
@@ -46,71 +35,14 @@ const WIDTH: [f64; 2] = [0.05, 0.65];
 const THIN_PX: f64 = 4.0;
 /// Step of the search, pixels.
 const STEP: f64 = 2.0;
-/// Places at which a guess is tested.
-const TESTED: usize = 72;
 /// Least part of an outline that has to carry edges for a guess to be followed up.
 const FOLLOWED: f64 = 0.3;
-/// How far from parallel the planes of a flat ring's two edges may seem, radians (0.15 degrees).
-const PARALLEL_RAD: f64 = 0.0026;
 /// Thicknesses at which the pose is fitted.
 const KNOTS: usize = 5;
-/// Most that an outline may leave the bar, pixels (root mean square): more, and it is something else that was followed.
-const MOST_SCATTER_PX: f64 = 0.45;
-/// Most scatter about the fitted bar in units of the edges' own uncertainty.
-const MOST_NOISE: f64 = 2.2;
-/// A bar thinner than this part of its ring's radius is one outline taken for two.
-const THINNEST: f64 = 0.015;
 /// Scatter and support of a bar that makes further guesses needless.
 const PLAIN: (f64, f64) = (0.3, 1.1);
 /// Guesses followed up.
 pub(in crate::offline) const GUESSES: usize = 3;
-/// Corners of a predicted outline.
-const CORNERS: usize = 720;
-
-/// One view of the search.
-struct View<'a, 'b> {
-    edges: &'a ViewEdges<'b>,
-    p: &'a Projection,
-    eye: Vector3<f64>,
-}
-
-impl View<'_, '_> {
-    /// Places along the outer and the inner outline where they are not hidden by the bar itself.
-    fn outlines(&self, torus: &Torus, corners: usize, step: f64) -> [Vec<Place>; 2] {
-        let mut curves = [Vec::with_capacity(corners), Vec::with_capacity(corners)];
-        for k in 0..corners {
-            let angle = std::f64::consts::TAU * k as f64 / corners as f64;
-            let both = outline(torus, &self.eye, angle);
-            for (i, curve) in curves.iter_mut().enumerate() {
-                let x = both.map(|b| b[i]).filter(|x| !hidden(torus, &self.eye, x, angle));
-                curve.push(x.map(|x| project(self.p, &x)).filter(|u| u.iter().all(|v| v.is_finite())));
-            }
-        }
-        let middle = project(self.p, &torus.centre);
-        curves.map(|c| places(&c, step, middle))
-    }
-}
-
-/// Whether another part of the bar stands before a point of its outline at a core angle.
-fn hidden(torus: &Torus, eye: &Vector3<f64>, x: &Vector3<f64>, angle: f64) -> bool {
-    const AROUND: usize = 48;
-    let sight = x - eye;
-    let reach = sight.norm();
-    let d = sight / reach;
-    let f = crate::offline::rim::circle::frame_of(&torus.normal);
-    let own = 3.0 * torus.bar / torus.core;
-    (0..AROUND).any(|k| {
-        let a = std::f64::consts::TAU * k as f64 / AROUND as f64;
-        let apart = (a - angle + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU) - std::f64::consts::PI;
-        if apart.abs() < own {
-            return false;
-        }
-        let c = torus.centre + (f.column(0) * a.cos() + f.column(1) * a.sin()) * torus.core - eye;
-        let along = c.dot(&d);
-        // The chord between two of the core's points strays from it by a little.
-        along < reach && (c - d * along).norm() < 0.97 * torus.bar
-    })
-}
 
 /// A thickness that both views support.
 #[derive(Clone, Copy, Debug)]
@@ -119,6 +51,8 @@ struct Guess {
     /// Whether the clicked outline is the outer one.
     clicked_outer: bool,
     worth: f64,
+    /// How likely the edges are the other outline: strong ones count for more.
+    likely: f64,
     /// By how much it is worth more than the median thickness.
     excess: f64,
 }
@@ -134,11 +68,11 @@ pub(in crate::offline) fn find(
 ) -> Search {
     let mut search = Search { found: Vec::new(), support: 0.0, excess: 0.0 };
     let Some(eyes) = camera_centre(p[0]).zip(camera_centre(p[1])) else { return search };
-    let views = [View { edges: views[0], p: p[0], eye: eyes.0 }, View { edges: views[1], p: p[1], eye: eyes.1 }];
+    let views = [View::new(views[0], clicked[0], p[0], eyes.0), View::new(views[1], clicked[1], p[1], eyes.1)];
     for g in guesses(&views, clicked, plane, options).into_iter().take(most) {
         search.support = search.support.max(g.worth);
         search.excess = search.excess.max(g.excess);
-        let Some(bar) = settle(&views, &g, options) else { continue };
+        let Some(bar) = settle(&views, g.torus, g.worth, options) else { continue };
         // Two guesses often lead to one bar.
         let same = |b: &BarFound| {
             let (x, y) = (&b.reconstruction, &bar.reconstruction);
@@ -201,22 +135,22 @@ fn guesses(
         let mut row: Vec<Guess> = Vec::new();
         for w in &widths {
             let Some(t) = between(&knots, *w, 0.5 * w * pixel) else { continue };
-            let (least, sum) = support(views, &t, clicked_outer, 2.0);
-            row.push(Guess { torus: t, clicked_outer, worth: least + 0.25 * sum, excess: 0.0 });
+            let (worth, likely) = support(views, &t, clicked_outer, 2.0);
+            row.push(Guess { torus: t, clicked_outer, worth, likely, excess: 0.0 });
         }
-        let usual = crate::offline::conic::robust::median(row.iter().map(|g| g.worth).collect());
+        let usual = median(row.iter().map(|g| g.worth).collect());
         row.iter_mut().for_each(|g| g.excess = g.worth - usual);
         for k in 0..row.len() {
-            let w = |k: Option<usize>| k.and_then(|k| row.get(k)).map_or(0.0, |g| g.worth);
+            let w = |k: Option<usize>| k.and_then(|k| row.get(k)).map_or(0.0, |g| g.likely);
             if let Some(g) = row
                 .get(k)
-                .filter(|g| g.worth >= 1.5 * FOLLOWED && g.worth > w(k.checked_sub(1)) && g.worth >= w(Some(k + 1)))
+                .filter(|g| g.worth >= 1.5 * FOLLOWED && g.likely > w(k.checked_sub(1)) && g.likely >= w(Some(k + 1)))
             {
                 out.push(sharper(g, views, &knots, pixel));
             }
         }
     }
-    out.sort_by(|a, b| b.worth.total_cmp(&a.worth));
+    out.sort_by(|a, b| b.likely.total_cmp(&a.likely));
     out.truncate(GUESSES);
     out
 }
@@ -241,135 +175,10 @@ fn sharper(guess: &Guess, views: &[View<'_, '_>; 2], knots: &[(f64, Torus)], pix
     for k in -6..=6 {
         let w = middle + 0.5 * f64::from(k);
         let Some(t) = between(knots, w, 0.5 * w * pixel).filter(|t| t.bar > 0.0) else { continue };
-        let worth = support(views, &t, guess.clicked_outer, 1.0).1;
-        if worth > best.0 {
-            best = (worth, t);
+        let likely = support(views, &t, guess.clicked_outer, 1.0).1;
+        if likely > best.0 {
+            best = (likely, t);
         }
     }
     Guess { torus: best.1, ..*guess }
-}
-
-/// Part of the other outline that carries edges: in the worse view, and in both.
-fn support(views: &[View<'_, '_>; 2], t: &Torus, clicked_outer: bool, tolerance: f64) -> (f64, f64) {
-    let (mut least, mut sum) = (f64::INFINITY, 0.0);
-    for v in views {
-        let [outer, inner] = v.outlines(t, TESTED, 0.0);
-        let other = if clicked_outer { inner } else { outer };
-        let c = v.edges.support(&other, tolerance, None).coverage();
-        least = f64::min(least, c);
-        sum += c;
-    }
-    (least, sum)
-}
-
-/// Follows all four outlines of a guess and fits the bar to them until it stands still.
-fn settle(views: &[View<'_, '_>; 2], guess: &Guess, options: &Options) -> Option<BarFound> {
-    let mut torus = guess.torus;
-    let bar = Options { rim: RimChoice::RoundBar, ..*options };
-    let free = if options.bar_diameter.is_some() { Free::KnownBar } else { Free::All };
-    for tolerance in [2.5, 1.5] {
-        let mut all: Vec<Ray> = Vec::new();
-        for v in views {
-            for places in v.outlines(&torus, CORNERS / 2, STEP_PX) {
-                let s = v.edges.support(&places, tolerance, None);
-                // Every other edge is enough to come near.
-                let points: Vec<EdgePoint> = s
-                    .hits
-                    .iter()
-                    .flatten()
-                    .step_by(2)
-                    .filter_map(|k| v.edges.arcs.ideal.get(*k as usize))
-                    .map(|i| EdgePoint::new(i.at.x, i.at.y, 0.1))
-                    .collect();
-                all.extend(rays(&points, v.p)?);
-            }
-        }
-        let mut keep = vec![true; all.len()];
-        for _ in 0..2 {
-            torus = fit(&all, &keep, &torus, free)?.torus;
-            let r: Vec<f64> = all.iter().map(|r| torus.residual(r).abs()).collect();
-            let gate = (4.0 * 1.48 * crate::offline::conic::robust::median(r.clone())).max(0.25);
-            keep = r.iter().map(|d| *d <= gate).collect();
-        }
-        if !(torus.bar > THINNEST * torus.core && torus.bar < 0.6 * torus.core) {
-            return None;
-        }
-    }
-    let mut last = None;
-    for (tolerance, sharp) in [(1.5, false), (1.0, true)] {
-        let follow = |v: &View<'_, '_>| -> Option<[Contour; 2]> {
-            let [outer, inner] = v.outlines(&torus, CORNERS, STEP_PX);
-            Some([v.edges.follow(&outer, tolerance, sharp)?, v.edges.follow(&inner, tolerance, sharp)?])
-        };
-        let [lo, li] = follow(&views[0])?;
-        let [ro, ri] = follow(&views[1])?;
-        let points = |o: &Contour, i: &Contour| {
-            let mut all = o.edge_points(Outline::Outer);
-            all.extend(i.edge_points(Outline::Inner));
-            all
-        };
-        let (l, r) = (points(&lo, &li), points(&ro, &ri));
-        let found = reconstruct(&l, views[0].p, &r, views[1].p, &bar).ok()?;
-        torus = Torus { centre: found.rim.centre, normal: found.rim.normal, core: found.rim.a, bar: found.bar_radius? };
-        let (outer, inner) = ([lo, ro], [li, ri]);
-        last = Some(BarFound { outer, inner, reconstruction: found, support: guess.worth });
-    }
-    last.filter(|b| b.is_sound() && torus.bar > THINNEST * torus.core)
-}
-
-impl BarFound {
-    /// Root mean square by which the outlines leave the bar, pixels: the worst of the four.
-    pub(in crate::offline) fn scatter(&self) -> f64 {
-        self.outer.iter().chain(&self.inner).map(|c| c.rms_px).fold(0.0, f64::max)
-    }
-
-    /// All points of a view, the outer outline first.
-    pub(in crate::offline) fn points(&self, view: usize) -> Vec<EdgePoint> {
-        let mut all = self.outer.get(view).map(|c| c.edge_points(Outline::Outer)).unwrap_or_default();
-        all.extend(self.inner.get(view).iter().flat_map(|c| c.edge_points(Outline::Inner)));
-        all
-    }
-
-    /// Whether the four outlines are those of one bar: they keep to it, and so do nearly all of their edges.
-    fn is_sound(&self) -> bool {
-        let r = &self.reconstruction.report;
-        let (used, all) = r.inliers.iter().flatten().fold((0, 0), |(u, n), k| (u + usize::from(*k), n + 1));
-        self.scatter() <= MOST_SCATTER_PX && r.noise <= MOST_NOISE && used * 10 >= all * 7
-    }
-
-    /// By how much the information criterion of two plane rims, one an outline, exceeds that of the bar on the same points: positive for a bar.
-    pub(in crate::offline) fn evidence(&self, p: [&Projection; 2], options: &Options) -> f64 {
-        let r = &self.reconstruction;
-        let sigmas = [self.points(0), self.points(1)];
-        let bar: Vec<f64> =
-            (0..2).flat_map(|k| r.report.residuals[k].iter().zip(&sigmas[k]).map(|(d, q)| d / q.sigma)).collect();
-        // Each outline a rim of its own, whatever the rig's doubt: it is the shape that is compared.
-        let lenient = Options { rim: RimChoice::Edge, calibration_px: 20.0, max_noise_px: 3.0, ..*options };
-        let mut flat = Vec::new();
-        let mut parameters = 0u32;
-        let mut normals = Vec::new();
-        for (contours, kind) in [(&self.outer, Outline::Outer), (&self.inner, Outline::Outer)] {
-            let [a, b] = [0, 1].map(|k| contours[k].edge_points(kind));
-            let Ok(rim) = reconstruct(&a, p[0], &b, p[1], &lenient) else { return f64::INFINITY };
-            normals.push((rim.rim.normal, rim.report.sigma_normal));
-            parameters += if rim.model == RimModel::Circle { 6 } else { 8 };
-            for (k, points) in [a, b].iter().enumerate() {
-                flat.extend(rim.report.residuals[k].iter().zip(points).map(|(d, q)| d / q.sigma));
-            }
-        }
-        let scale = |v: &[f64]| 1.48 * crate::offline::conic::robust::median(v.iter().map(|d| d.abs()).collect());
-        let noise = scale(&bar).min(scale(&flat)).max(1e-6);
-        let most = crate::offline::conic::robust::GATE * noise;
-        let sum = |v: &[f64]| -> f64 {
-            v.iter().map(|d| if d.is_finite() { d.abs().min(most).powi(2) } else { most * most }).sum::<f64>()
-                / (noise * noise)
-        };
-        let each = (bar.len().max(1) as f64).ln();
-        // The edges of a flat ring lie in parallel planes; the outlines of a bar seem to lie in planes tipped opposite ways.
-        let tipped = match normals.as_slice() {
-            [(n, s), (m, t)] => (n.angle(m) / s.hypot(*t).hypot(PARALLEL_RAD)).powi(2),
-            _ => 0.0,
-        };
-        (sum(&flat) + tipped + f64::from(parameters) * each) - (sum(&bar) + 7.0 * each)
-    }
 }

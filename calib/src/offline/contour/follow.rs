@@ -5,7 +5,6 @@
 
 use crate::offline::contour::quick_fit::{Sums, Walk};
 use crate::offline::contour::{Contour, ContourPoint, FLOOR_PX, INDEPENDENT_PX, LEAST_COVERAGE, ViewEdges};
-use crate::offline::edges::sharpen::sharpen;
 use crate::offline::edges::{Refined, refine};
 use crate::offline::rim::model::{EdgePoint, Outline};
 use graspd_rt::geom::Pixel;
@@ -20,6 +19,9 @@ pub(in crate::offline) struct Place {
     pub(in crate::offline) radius: f64,
 }
 
+/// Brings an edge to its place, given it and the direction out of the curve (raw pixels); `None` where nobody can tell.
+pub(in crate::offline) type Finish<'f> = dyn Fn(&Refined, Pixel) -> Option<Refined> + 'f;
+
 /// Where a curve carries edges.
 #[derive(Clone, Debug, Default)]
 pub(in crate::offline) struct Support {
@@ -27,12 +29,6 @@ pub(in crate::offline) struct Support {
     pub(in crate::offline) seen: usize,
     /// Edge found at each place, if any.
     pub(in crate::offline) hits: Vec<Option<u32>>,
-}
-
-impl Support {
-    pub(in crate::offline) fn coverage(&self) -> f64 {
-        self.hits.iter().flatten().count() as f64 / self.seen.max(1) as f64
-    }
 }
 
 /// Places along a closed polygon of ideal pixels at about one `step`; stretches between flagged-out corners are left out.
@@ -94,8 +90,13 @@ impl ViewEdges<'_> {
         out
     }
 
-    /// The contour along a curve: its edges within a tolerance, told apart from their neighbours. Its ellipse is only the nearest one.
-    pub(in crate::offline) fn follow(&self, places: &[Place], tolerance: f64, sharp: bool) -> Option<Contour> {
+    /// The contour along a curve: its edges within a tolerance, brought to their place by `finish` if there is one. Its ellipse is only the nearest one.
+    pub(in crate::offline) fn follow(
+        &self,
+        places: &[Place],
+        tolerance: f64,
+        finish: Option<&Finish<'_>>,
+    ) -> Option<Contour> {
         let any = self.support(places, tolerance, None);
         let bright =
             |k: u32, p: &Place| self.arcs.ideal.get(k as usize).is_some_and(|i| i.towards_bright.dot(&p.normal) < 0.0);
@@ -120,11 +121,11 @@ impl ViewEdges<'_> {
                 rejected.push(edge.at);
                 continue;
             };
-            let sign = if r.towards_bright.dot(&p.normal) < 0.0 { -1.0 } else { 1.0 };
-            let r = if sharp {
+            let r = if let Some(finish) = finish {
                 let ahead = self.lens.raw(p.at + p.normal * 0.5) - self.lens.raw(p.at - p.normal * 0.5);
-                let Some(towards_bright) = (ahead * sign).try_normalize(1e-9) else { continue };
-                match sharpen(self.picture, &Refined { towards_bright, ..r }, self.map.noise(), self.blur()) {
+                let Some(out) = ahead.try_normalize(1e-9) else { continue };
+                let sign = if r.towards_bright.dot(&p.normal) < 0.0 { -1.0 } else { 1.0 };
+                match finish(&Refined { towards_bright: out * sign, ..r }, out) {
                     Some(r) => r,
                     None => {
                         rejected.push(edge.at);

@@ -7,6 +7,7 @@
 pub(in crate::offline) mod follow;
 pub(in crate::offline) mod quick_fit;
 pub mod select;
+mod through;
 
 use crate::offline::contour::quick_fit::{Sums, Walk};
 use crate::offline::edges::arcs::Arcs;

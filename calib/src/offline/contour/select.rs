@@ -3,6 +3,7 @@
 //! A click near a painted line means one of its two edges, and nobody knows which; the other view decides. So a selection gives a few contours, the
 //! likeliest first, each through edges next to the click, and the pair that is the picture of one rim is taken (see [`crate::offline::pairs::pairing`]).
 
+use crate::offline::contour::quick_fit::Walk;
 use crate::offline::contour::{Contour, LEAST_COVERAGE, Trial, ViewEdges, alike};
 use graspd_rt::geom::{Pixel, View};
 
@@ -111,6 +112,13 @@ pub fn snap_radius(width: usize) -> f64 {
     (0.01 * width as f64).clamp(8.0, 20.0)
 }
 
+/// Cost from which a contour through the edges at the click is doubtful enough to look for one that passes it in a gap.
+const DOUBTFUL: f64 = 6.0;
+/// What it costs a contour to have no edge at the click, pixels.
+const IN_A_GAP: f64 = 3.0;
+/// Arcs tried for such a contour.
+const GAP_SEEDS: usize = 6;
+
 /// Contours that a selection may mean, likeliest first, at most `keep`.
 pub fn contours(
     view: View,
@@ -178,7 +186,34 @@ fn click(view: View, edges: &ViewEdges<'_>, at: Pixel, keep: usize) -> Result<Ve
             }
         }
     }
+    if out.iter().all(|c| c.cost > DOUBTFUL) {
+        through(edges, at, radius, &mut out);
+    }
     finish(view, at, best, out, keep)
+}
+
+/// Adds contours that pass a click in a gap.
+fn through(edges: &ViewEdges<'_>, at: Pixel, radius: f64, out: &mut Vec<Candidate>) {
+    let Some(ideal) = edges.lens.ideal(at) else { return };
+    for seed in edges.passing(ideal, radius, GAP_SEEDS) {
+        // Most arcs of a contour lead to the same one.
+        let known = |c: &Candidate| {
+            edges.arcs.ideal.get(seed).is_some_and(|e| Walk::new(&c.contour.ellipse).measure(e.at).0.abs() < 1.0)
+        };
+        if out.iter().any(known) {
+            continue;
+        }
+        for t in edges.trials(seed, 1) {
+            let off = Walk::new(&t.ellipse).measure(ideal).0.abs();
+            if off > radius {
+                continue;
+            }
+            if let Some(contour) = edges.contour(&t) {
+                let cost = off + unlikely(&contour) + IN_A_GAP;
+                push(out, Candidate { contour, cost });
+            }
+        }
+    }
 }
 
 fn points(view: View, edges: &ViewEdges<'_>, at: &[Pixel], keep: usize) -> Result<Vec<Candidate>, SelectError> {
@@ -195,7 +230,7 @@ fn points(view: View, edges: &ViewEdges<'_>, at: &[Pixel], keep: usize) -> Resul
                 best = best.max(t.coverage);
                 // Most of the points have to lie on it: one slip of the hand is forgiven, a different contour is not.
                 let far = |t: &Trial| {
-                    let w = crate::offline::contour::quick_fit::Walk::new(&t.ellipse);
+                    let w = Walk::new(&t.ellipse);
                     let mut d: Vec<f64> = at
                         .iter()
                         .map(|p| edges.lens.ideal(*p).map_or(f64::INFINITY, |i| w.measure(i).0.abs()))
@@ -241,10 +276,7 @@ fn boxed(view: View, edges: &ViewEdges<'_>, a: Pixel, b: Pixel, keep: usize) -> 
         let Some(seed) = arc.edges.get(arc.edges.len() / 2) else { continue };
         if let Some(p) = edges.map.edges().get(*seed as usize).and_then(|e| edges.lens.ideal(e.at)) {
             // Most seeds lie on a contour that is already known.
-            if out
-                .iter()
-                .any(|c| crate::offline::contour::quick_fit::Walk::new(&c.contour.ellipse).measure(p).0.abs() < 1.0)
-            {
+            if out.iter().any(|c| Walk::new(&c.contour.ellipse).measure(p).0.abs() < 1.0) {
                 continue;
             }
         }
@@ -252,7 +284,7 @@ fn boxed(view: View, edges: &ViewEdges<'_>, a: Pixel, b: Pixel, keep: usize) -> 
             best = best.max(t.coverage);
             let Some(contour) = edges.contour(&t) else { continue };
             let (mut l, mut h) = (Pixel::repeat(f64::INFINITY), Pixel::repeat(f64::NEG_INFINITY));
-            let w = crate::offline::contour::quick_fit::Walk::new(&contour.ellipse);
+            let w = Walk::new(&contour.ellipse);
             for t in w.parameters(4.0, 400) {
                 let p = edges.lens.raw(w.at(t).0);
                 l = l.inf(&p);

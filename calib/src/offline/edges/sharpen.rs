@@ -10,11 +10,13 @@ use graspd_rt::geom::Pixel;
 use nalgebra::{SMatrix, SVector};
 
 /// Smoothing of the slope, pixels: less than in detection, to keep neighbours apart.
-const SCALE: f64 = 0.7;
+pub(in crate::offline) const SCALE: f64 = 0.7;
 /// Radius of the sampled kernel, pixels.
 const RADIUS: usize = 4;
 /// The slope is sampled from minus to plus this many half pixels.
-const REACH: i32 = 10;
+pub(in crate::offline) const REACH: i32 = 10;
+/// Samples of a slope.
+pub(in crate::offline) const SLOPES: usize = 2 * REACH as usize + 1;
 /// Steps that a slope is taken apart into at most.
 const STEPS: usize = 4;
 /// Places along the edge whose slopes are averaged, pixels.
@@ -22,9 +24,9 @@ const ASIDE: [f64; 3] = [-1.0, 0.0, 1.0];
 /// Variance along the edge that the averaging adds.
 const ASIDE_VARIANCE: f64 = 2.0 / 3.0;
 /// Standard deviation of the averaged slope for a pixel noise of one grey level (by simulation of white noise).
-const SLOPE_NOISE: f64 = 0.27;
+pub(in crate::offline) const SLOPE_NOISE: f64 = 0.27;
 /// What the correlation of neighbouring samples adds to the variance of a fitted place (by the same simulation, in the test below).
-const CORRELATED: f64 = 4.2;
+pub(in crate::offline) const CORRELATED: f64 = 4.2;
 /// Neighbours closer than this many widths of the blurred step are not told apart reliably where surfaces are shaded and curved.
 const CROWDED: f64 = 2.0;
 /// Standard deviation of an edge with such a neighbour, pixels.
@@ -56,7 +58,7 @@ struct Fit {
     strength: [f64; STEPS],
     place: [f64; STEPS],
     count: usize,
-    left: [f64; 2 * REACH as usize + 1],
+    left: [f64; SLOPES],
     variance: f64,
 }
 
@@ -65,15 +67,7 @@ struct Fit {
 /// `None` where the edge is not a step that can be told from its surroundings.
 pub fn sharpen(picture: &Picture, start: &Refined, noise: f64, blur: f64) -> Option<Refined> {
     let n = start.towards_bright;
-    let along = Pixel::new(-n.y, n.x);
-    let mut slope = [0.0; 2 * REACH as usize + 1];
-    for (k, s) in slope.iter_mut().enumerate() {
-        let t = 0.5 * (k as f64 - f64::from(REACH));
-        for a in ASIDE {
-            *s += slope_at(picture, start.at + n * t + along * a, n)?;
-        }
-        *s /= ASIDE.len() as f64;
-    }
+    let slope = slopes(picture, start.at, n)?;
     let width = SCALE.hypot(blur);
     let peak = slope.get(REACH as usize).copied()?;
     if !(peak > 3.0 * SLOPE_NOISE * noise) {
@@ -131,13 +125,31 @@ pub fn sharpen(picture: &Picture, start: &Refined, noise: f64, blur: f64) -> Opt
         .filter(|(p, s)| (*p - moved).abs() < CROWDED * width && s.abs() > 0.12 * fit.strength[0])
         .count();
     let doubt = if crowded > 0 { doubt.max(2.0 * CROWDED_PX) } else { doubt };
-    let tangential = (SCALE * SCALE + ASIDE_VARIANCE + blur * blur).sqrt();
     Some(Refined {
         at: start.at + n * moved,
         towards_bright: n,
         sigma: sigma.hypot(0.5 * doubt).max(0.01),
-        width: tangential,
+        width: tangential_width(blur),
     })
+}
+
+/// Slopes across an edge at every half pixel, [`REACH`] of them to each side, averaged along it; `None` at the picture's border.
+pub(in crate::offline) fn slopes(picture: &Picture, at: Pixel, n: Pixel) -> Option<[f64; SLOPES]> {
+    let along = Pixel::new(-n.y, n.x);
+    let mut slope = [0.0; SLOPES];
+    for (k, s) in slope.iter_mut().enumerate() {
+        let t = 0.5 * (k as f64 - f64::from(REACH));
+        for a in ASIDE {
+            *s += slope_at(picture, at + n * t + along * a, n)?;
+        }
+        *s /= ASIDE.len() as f64;
+    }
+    Some(slope)
+}
+
+/// Standard deviation along the edge of what a slope is averaged over, pixels: a curve is seen that much nearer to its inside.
+pub(in crate::offline) fn tangential_width(blur: f64) -> f64 {
+    (SCALE * SCALE + ASIDE_VARIANCE + blur * blur).sqrt()
 }
 
 /// Least squares on strengths and places; `None` when it fails. The variance is that of the first place for unit slope noise.

@@ -5,7 +5,8 @@
 //! is never the outer one of the other. Where the rim may be a round bar, the bar that has the clicked outlines is looked for, and the shape of all four
 //! outlines decides. What neither of both explains better is refused: a bar taken for a plane edge is wrong by degrees without looking so.
 
-use crate::offline::bar::search::{self, BarFound};
+use crate::offline::bar::found::BarFound;
+use crate::offline::bar::search;
 use crate::offline::contour::select::Candidate;
 use crate::offline::contour::{Contour, ViewEdges};
 use crate::offline::rim::model::{Options, Outline, Projection, Reconstruction, RimChoice, RimModel};
@@ -106,7 +107,7 @@ fn misfit(pair: &Pair) -> f64 {
 }
 
 /// By how much the information criterion has to prefer one model before the other is forgotten.
-const DECISIVE: f64 = 20.0;
+const DECISIVE: f64 = 60.0;
 
 /// Chi-squared per degree of freedom up to which a circle is clean.
 const CLEAN: f64 = 1.6;

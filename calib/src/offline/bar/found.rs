@@ -1,0 +1,105 @@
+//! A bar that was found, and by how much its outlines are those of a bar rather than the edges of something flat.
+
+use crate::offline::conic::robust::{GATE, median};
+use crate::offline::contour::{Contour, LEAST_COVERAGE};
+use crate::offline::rim::model::{EdgePoint, Options, Outline, Projection, Reconstruction, RimChoice, RimModel};
+use crate::offline::rim::reconstruct::reconstruct;
+
+/// How far from parallel the planes of a flat ring's two edges may seem, radians (0.15 degrees).
+const PARALLEL_RAD: f64 = 0.0026;
+/// Most that an outline may leave the bar, pixels (root mean square): more, and it is something else that was followed.
+const MOST_SCATTER_PX: f64 = 0.45;
+/// Most scatter about the fitted bar in units of the edges' own uncertainty.
+const MOST_NOISE: f64 = 2.2;
+
+/// A bar and its outlines.
+#[derive(Clone, Debug)]
+pub(in crate::offline) struct BarFound {
+    /// Outer outlines, left and right.
+    pub(in crate::offline) outer: [Contour; 2],
+    /// Inner outlines, left and right.
+    pub(in crate::offline) inner: [Contour; 2],
+    /// Both outlines of both views as a round bar.
+    pub(in crate::offline) reconstruction: Reconstruction,
+    /// Support of the guess that led to it.
+    pub(in crate::offline) support: f64,
+}
+
+impl BarFound {
+    /// Root mean square by which the outlines leave the bar, pixels, and the part of each outline that keeps to it: the worst of the four.
+    ///
+    /// Edges that the fit left out are another's; they count as missing, not as scatter.
+    fn kept(&self) -> (f64, f64) {
+        let r = &self.reconstruction.report;
+        let (mut scatter, mut part) = (0.0, 1.0);
+        for view in 0..2 {
+            let mut next = r.residuals[view].iter().zip(&r.inliers[view]);
+            for c in [&self.outer[view], &self.inner[view]] {
+                let (mut sum, mut n) = (0.0, 0usize);
+                for (d, _) in next.by_ref().take(c.points.len()).filter(|(_, used)| **used) {
+                    sum += d * d;
+                    n += 1;
+                }
+                scatter = f64::max(scatter, (sum / n.max(1) as f64).sqrt());
+                part = f64::min(part, c.coverage * n as f64 / c.points.len().max(1) as f64);
+            }
+        }
+        (scatter, part)
+    }
+
+    /// Root mean square by which the outlines leave the bar, pixels: the worst of the four.
+    pub(in crate::offline) fn scatter(&self) -> f64 {
+        self.kept().0
+    }
+
+    /// All points of a view, the outer outline first.
+    pub(in crate::offline) fn points(&self, view: usize) -> Vec<EdgePoint> {
+        let mut all = self.outer.get(view).map(|c| c.edge_points(Outline::Outer)).unwrap_or_default();
+        all.extend(self.inner.get(view).iter().flat_map(|c| c.edge_points(Outline::Inner)));
+        all
+    }
+
+    /// Whether the four outlines are those of one bar: they keep to it, and so do nearly all of their edges.
+    pub(in crate::offline::bar) fn is_sound(&self) -> bool {
+        let r = &self.reconstruction.report;
+        let (used, all) = r.inliers.iter().flatten().fold((0, 0), |(u, n), k| (u + usize::from(*k), n + 1));
+        let (scatter, part) = self.kept();
+        scatter <= MOST_SCATTER_PX && part >= LEAST_COVERAGE && r.noise <= MOST_NOISE && used * 10 >= all * 7
+    }
+
+    /// By how much the information criterion of two plane rims, one an outline, exceeds that of the bar on the same points: positive for a bar.
+    pub(in crate::offline) fn evidence(&self, p: [&Projection; 2], options: &Options) -> f64 {
+        let r = &self.reconstruction;
+        let sigmas = [self.points(0), self.points(1)];
+        let bar: Vec<f64> =
+            (0..2).flat_map(|k| r.report.residuals[k].iter().zip(&sigmas[k]).map(|(d, q)| d / q.sigma)).collect();
+        // Each outline a rim of its own, whatever the rig's doubt: it is the shape that is compared.
+        let lenient = Options { rim: RimChoice::Edge, calibration_px: 20.0, max_noise_px: 3.0, ..*options };
+        let mut flat = Vec::new();
+        let mut parameters = 0u32;
+        let mut normals = Vec::new();
+        for (contours, kind) in [(&self.outer, Outline::Outer), (&self.inner, Outline::Outer)] {
+            let [a, b] = [0, 1].map(|k| contours[k].edge_points(kind));
+            let Ok(rim) = reconstruct(&a, p[0], &b, p[1], &lenient) else { return f64::INFINITY };
+            normals.push((rim.rim.normal, rim.report.sigma_normal));
+            parameters += if rim.model == RimModel::Circle { 6 } else { 8 };
+            for (k, points) in [a, b].iter().enumerate() {
+                flat.extend(rim.report.residuals[k].iter().zip(points).map(|(d, q)| d / q.sigma));
+            }
+        }
+        let scale = |v: &[f64]| 1.48 * median(v.iter().map(|d| d.abs()).collect());
+        let noise = scale(&bar).min(scale(&flat)).max(1e-6);
+        let most = GATE * noise;
+        let sum = |v: &[f64]| -> f64 {
+            v.iter().map(|d| if d.is_finite() { d.abs().min(most).powi(2) } else { most * most }).sum::<f64>()
+                / (noise * noise)
+        };
+        let each = (bar.len().max(1) as f64).ln();
+        // The edges of a flat ring lie in parallel planes; the outlines of a bar seem to lie in planes tipped opposite ways.
+        let tipped = match normals.as_slice() {
+            [(n, s), (m, t)] => (n.angle(m) / s.hypot(*t).hypot(PARALLEL_RAD)).powi(2),
+            _ => 0.0,
+        };
+        (sum(&flat) + tipped + f64::from(parameters) * each) - (sum(&bar) + 7.0 * each)
+    }
+}
