@@ -66,6 +66,9 @@ fn main() {
         });
         let mut options = PlanOptions::default();
         options.rim.rim = choice;
+        // The tolerance of the command line.
+        options.rim.max_sigma_centre = Some(1e-3);
+        options.rim.max_sigma_normal = 0.5_f64.to_radians();
         total += 1;
         let name = dir.file_name().unwrap().to_string_lossy().into_owned();
         let bar = numbers(&truth["bar"]);

@@ -9,6 +9,9 @@ use crate::offline::rim::reconstruct::reconstruct;
 const PARALLEL_RAD: f64 = 0.0026;
 /// Most that an outline may leave the bar, pixels (root mean square): more, and it is something else that was followed.
 const MOST_SCATTER_PX: f64 = 0.45;
+/// The fewer edges an outline has, the closer they have to keep to it: what may leave it, pixels, for a share of next to none, and more for each share.
+const SCATTER_AT_NONE: f64 = 0.1;
+const SCATTER_PER_PART: f64 = 0.75;
 /// Most scatter about the fitted bar in units of the edges' own uncertainty.
 const MOST_NOISE: f64 = 2.2;
 
@@ -64,7 +67,8 @@ impl BarFound {
         let r = &self.reconstruction.report;
         let (used, all) = r.inliers.iter().flatten().fold((0, 0), |(u, n), k| (u + usize::from(*k), n + 1));
         let (scatter, part) = self.kept();
-        scatter <= MOST_SCATTER_PX && part >= LEAST_COVERAGE && r.noise <= MOST_NOISE && used * 10 >= all * 7
+        let limit = MOST_SCATTER_PX.min(SCATTER_AT_NONE + SCATTER_PER_PART * part);
+        scatter <= limit && part >= LEAST_COVERAGE && r.noise <= MOST_NOISE && used * 10 >= all * 7
     }
 
     /// By how much the information criterion of two plane rims, one an outline, exceeds that of the bar on the same points: positive for a bar.

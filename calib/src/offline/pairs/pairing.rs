@@ -153,7 +153,9 @@ pub fn pair(
     p: [&Projection; 2],
     options: &Options,
 ) -> Result<Pair, Unpaired> {
-    let mut found = likeliest(views, candidates, p, options)?;
+    // What the task tolerates must not choose the contours: a wrong pair may well be the more certain one.
+    let whatever = Options { max_sigma_centre: Some(f64::INFINITY), max_sigma_normal: f64::INFINITY, ..*options };
+    let mut found = likeliest(views, candidates, p, &whatever)?;
     found.doubt(p, options).map_err(|refusal| Unpaired { refusal, swapped_fits: false })?;
     Ok(found)
 }
