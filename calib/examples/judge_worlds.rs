@@ -80,7 +80,7 @@ fn main() {
                 let e = errors(&p, &truth["circles"][0]);
                 let r = &p.reconstruction;
                 println!(
-                    "{name:<10} {:9} centre {:.3} mm, normal {:.3} deg; sigma {:.3} {:.3}; distance {:.1} {:.1}; a {:.2} b {:.2} r {:.2} (bar {:.1} {:.1}) chi2 {:.2} gap {:.2?} px {:.0} ms",
+                    "{name:<10} {:9} centre {:.3} mm, normal {:.3} deg; sigma {:.3} {:.3}; distance {:.1} {:.1}; a {:.2} b {:.2} r {:.2} (bar {:.1} {:.1}) chi2 {:.2} rms {:.2?} gap {:.2?} px {:.0} ms",
                     p.file.object.model,
                     e[0],
                     e[1],
@@ -94,6 +94,7 @@ fn main() {
                     bar[0] * 1e3,
                     bar[1] * 1e3,
                     p.file.object.chi2_per_dof,
+                    [p.contours[0].rms_px, p.contours[1].rms_px],
                     r.report.gap_px,
                     before.elapsed().as_secs_f64() * 1e3,
                 );

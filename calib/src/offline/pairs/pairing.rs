@@ -43,8 +43,8 @@ const OTHER_SIDE: f64 = 12.0;
 /// a pixel, all round alike or in step with the tilt, which no count of points averages out.
 const ROUND_PX: f64 = 1.0;
 
-/// How far apart the tangents of an ellipse's two contours may be, in units of the rig's own doubt.
-const ELLIPSE_GAP: f64 = 1.5;
+/// How far apart the tangents of two contours that are no clean circle may be, in units of the rig's own doubt.
+const UNCLEAN_GAP: f64 = 1.5;
 
 /// Thinnest bar in parts of its ring's radius.
 const THINNEST: f64 = 0.015;
@@ -74,13 +74,13 @@ fn sharpened(
             }
         }
     }
-    // Noise that hides a gap in sigmas does not make two contours one. That two ellipses are a circle speaks for itself; that they are some ellipse
-    // is all but always so, and only the tangents tell whether they belong together.
+    // Noise that hides a gap in sigmas does not make two contours one. That two ellipses are a circle to within their edges' noise speaks for itself; that
+    // they are some ellipse is all but always so, and only the tangents tell whether they belong together.
     let r = &reconstruction.report;
     let doubt = options.calibration_px.max(0.25);
-    let limit = match reconstruction.model {
-        RimModel::Ellipse => ELLIPSE_GAP * doubt,
-        _ => options.gate_sigmas * doubt + 1.0,
+    let limit = match is_clean_circle(&reconstruction) {
+        true => options.gate_sigmas * doubt + 1.0,
+        false => UNCLEAN_GAP * doubt,
     };
     if largest_gap(&reconstruction) > limit {
         let (gap_px, gap_sigma_px) = (r.gap_px, r.gap_sigma_px);
