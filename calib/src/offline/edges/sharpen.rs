@@ -19,6 +19,10 @@ pub(in crate::offline) const REACH: i32 = 10;
 pub(in crate::offline) const SLOPES: usize = 2 * REACH as usize + 1;
 /// Steps that a slope is taken apart into at most.
 const STEPS: usize = 4;
+/// Shading of the surfaces beside an edge: change a pixel in parts of the edge's own step (standard deviation).
+const SHADING: f64 = 0.006;
+/// Weight that keeps the shading at nothing.
+const FIRM: f64 = 1e12;
 /// Places along the edge whose slopes are averaged, pixels.
 const ASIDE: [f64; 3] = [-1.0, 0.0, 1.0];
 /// Variance along the edge that the averaging adds.
@@ -58,6 +62,10 @@ struct Fit {
     strength: [f64; STEPS],
     place: [f64; STEPS],
     count: usize,
+    /// Slope of the shading on the dark and on the bright side of the first step, grey levels a pixel.
+    shading: [f64; 2],
+    /// Weight of what is known about the shading beforehand.
+    prior: f64,
     left: [f64; SLOPES],
     variance: f64,
 }
@@ -74,7 +82,16 @@ pub fn sharpen(picture: &Picture, start: &Refined, noise: f64, blur: f64) -> Opt
         return None;
     }
     let unit = width * (2.0 * std::f64::consts::PI).sqrt();
-    let mut fit = Fit { strength: [0.0; STEPS], place: [0.0; STEPS], count: 1, left: slope, variance: 0.0 };
+    let quiet = SLOPE_NOISE * noise.max(0.3);
+    let mut fit = Fit {
+        strength: [0.0; STEPS],
+        place: [0.0; STEPS],
+        count: 1,
+        shading: [0.0; 2],
+        prior: FIRM,
+        left: slope,
+        variance: 0.0,
+    };
     fit.strength[0] = peak * unit;
     solve(&slope, width, &mut fit)?;
     while fit.count < STEPS {
@@ -88,7 +105,7 @@ pub fn sharpen(picture: &Picture, start: &Refined, noise: f64, blur: f64) -> Opt
         if worst.abs() < enough {
             break;
         }
-        let before = (fit.strength, fit.place, fit.count, fit.left, fit.variance);
+        let before = (fit.strength, fit.place, fit.count, fit.left, fit.variance, fit.shading);
         if let (Some(s), Some(p)) = (fit.strength.get_mut(fit.count), fit.place.get_mut(fit.count)) {
             *s = worst * unit;
             *p = at;
@@ -97,10 +114,13 @@ pub fn sharpen(picture: &Picture, start: &Refined, noise: f64, blur: f64) -> Opt
         let sum = |r: &[f64]| r.iter().map(|x| x * x).sum::<f64>();
         if solve(&slope, width, &mut fit).is_none() || sum(&fit.left) > 0.8 * sum(&before.3) {
             // A step that explains nothing is none.
-            (fit.strength, fit.place, fit.count, fit.left, fit.variance) = before;
+            (fit.strength, fit.place, fit.count, fit.left, fit.variance, fit.shading) = before;
             break;
         }
     }
+    // Shading explains part of any neighbour, so it is only let in when the neighbours are known.
+    fit.prior = (quiet / (SHADING * fit.strength[0])).powi(2);
+    solve(&slope, width, &mut fit)?;
     let moved = fit.place[0];
     // Swapped with a neighbour, or dissolved into several: better no point than a wrong one.
     if fit.strength[0] <= 0.0 || moved.abs() > 1.0 {
@@ -154,7 +174,8 @@ pub(in crate::offline) fn tangential_width(blur: f64) -> f64 {
 
 /// Least squares on strengths and places; `None` when it fails. The variance is that of the first place for unit slope noise.
 fn solve(slope: &[f64], width: f64, fit: &mut Fit) -> Option<()> {
-    const N: usize = 2 * STEPS;
+    const N: usize = 2 * STEPS + 2;
+    const SHADE: usize = 2 * STEPS;
     let unit = width * (2.0 * std::f64::consts::PI).sqrt();
     let at = |i: usize| 0.5 * (i as f64 - f64::from(REACH));
     let model = |fit: &Fit, t: f64| -> (f64, SVector<f64, N>) {
@@ -167,6 +188,14 @@ fn solve(slope: &[f64], width: f64, fit: &mut Fit) -> Option<()> {
             d[2 * k] = g;
             d[2 * k + 1] = fit.strength[k] * g * z / width;
         }
+        // The shading of either side ends at the first step, where both are blurred into each other.
+        let z = (t - fit.place[0]) / width;
+        let bright = 0.5 + 0.5 * (0.797_885 * z + 0.035_68 * z * z * z).tanh();
+        let g = (-0.5 * z * z).exp() / unit;
+        y += fit.shading[0] * (1.0 - bright) + fit.shading[1] * bright;
+        d[1] += (fit.shading[0] - fit.shading[1]) * g;
+        d[SHADE] = 1.0 - bright;
+        d[SHADE + 1] = bright;
         (y, d)
     };
     let cost = |fit: &mut Fit| -> f64 {
@@ -176,7 +205,7 @@ fn solve(slope: &[f64], width: f64, fit: &mut Fit) -> Option<()> {
             fit.left[i] = r;
             sum += r * r;
         }
-        sum
+        sum + fit.prior * fit.shading.iter().map(|s| s * s).sum::<f64>()
     };
     // Normal matrix and gradient; unused steps stand still.
     let normal = |fit: &Fit| -> (SMatrix<f64, N, N>, SVector<f64, N>) {
@@ -188,7 +217,11 @@ fn solve(slope: &[f64], width: f64, fit: &mut Fit) -> Option<()> {
         }
         let size = a.diagonal().max();
         for k in 0..N {
-            a[(k, k)] = if k < 2 * fit.count { a[(k, k)] + 1e-12 * size } else { 1.0 };
+            a[(k, k)] = if k < 2 * fit.count || k >= SHADE { a[(k, k)] + 1e-12 * size } else { 1.0 };
+        }
+        for k in 0..2 {
+            a[(SHADE + k, SHADE + k)] += fit.prior;
+            g[SHADE + k] -= fit.prior * fit.shading[k];
         }
         (a, g)
     };
@@ -200,7 +233,10 @@ fn solve(slope: &[f64], width: f64, fit: &mut Fit) -> Option<()> {
             a[(k, k)] *= 1.0 + damp;
         }
         let step = a.cholesky()?.solve(&g);
-        let (strength, place, left) = (fit.strength, fit.place, fit.left);
+        let (strength, place, left, shading) = (fit.strength, fit.place, fit.left, fit.shading);
+        for k in 0..2 {
+            fit.shading[k] += step[SHADE + k];
+        }
         for k in 0..fit.count {
             fit.strength[k] += step[2 * k];
             fit.place[k] += step[2 * k + 1].clamp(-0.7, 0.7);
@@ -217,7 +253,7 @@ fn solve(slope: &[f64], width: f64, fit: &mut Fit) -> Option<()> {
                 break;
             }
         } else {
-            (fit.strength, fit.place, fit.left) = (strength, place, left);
+            (fit.strength, fit.place, fit.left, fit.shading) = (strength, place, left, shading);
             damp *= 10.0;
             if damp > 1e4 {
                 break;
