@@ -324,10 +324,12 @@ pub fn outline(torus: &Torus, eye: &Vector3<f64>, angle: f64) -> Option<[Vector3
     if !(h > torus.bar) {
         return None;
     }
-    let (middle, half) = (b.atan2(a), (-torus.bar / h).acos());
-    let mut v = [middle + half, middle - half];
-    if v[1].cos() > v[0].cos() {
+    // Cosine and sine of `atan2(b, a)` plus and minus `acos(-r / h)`.
+    let ((sm, cm), ch) = ((b / h, a / h), -torus.bar / h);
+    let sh = (1.0 - ch * ch).max(0.0).sqrt();
+    let mut v = [(cm * ch - sm * sh, sm * ch + cm * sh), (cm * ch + sm * sh, sm * ch - cm * sh)];
+    if v[1].0 > v[0].0 {
         v.swap(0, 1);
     }
-    Some(v.map(|v| torus.centre + e * (torus.core + torus.bar * v.cos()) + torus.normal * (torus.bar * v.sin())))
+    Some(v.map(|(cos, sin)| torus.centre + e * (torus.core + torus.bar * cos) + torus.normal * (torus.bar * sin)))
 }
