@@ -34,10 +34,14 @@ impl OrientedBox {
     /// Part of the segment from `a` to `b` that lies inside, as fractions `(enter, leave)`; `None` when it misses.
     pub fn cut(&self, a: &Vec3, b: &Vec3) -> Option<(f64, f64)> {
         let inv = self.frame_from_box.inverse();
-        let (p, q) = (inv * Point3::from(*a), inv * Point3::from(*b));
+        Self::cut_own(&self.half, &(inv * Point3::from(*a)).coords, &(inv * Point3::from(*b)).coords)
+    }
+
+    /// The same for a box of these half sizes and a segment in the box's own frame.
+    pub fn cut_own(half: &Vec3, p: &Vec3, q: &Vec3) -> Option<(f64, f64)> {
         let (mut t0, mut t1) = (0.0f64, 1.0f64);
         for k in 0..3 {
-            let (s, d, h) = (p[k], q[k] - p[k], self.half[k]);
+            let (s, d, h) = (p[k], q[k] - p[k], half[k]);
             if d.abs() < 1e-15 {
                 if s.abs() > h {
                     return None;

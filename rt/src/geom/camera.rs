@@ -76,12 +76,14 @@ impl Camera {
     }
 
     /// Pixel of a normalized image point: distortion, then the pinhole.
+    #[inline]
     pub fn distort(&self, n: Normalized) -> Pixel {
         let (p, _) = self.distort_with_jacobian(n);
         p
     }
 
     /// Pixel of a normalized image point, and its derivative (pixels per unit of normalized coordinate, 2x2).
+    #[inline]
     pub fn distort_with_jacobian(&self, n: Normalized) -> (Pixel, Matrix2<f64>) {
         let d = &self.distortion;
         let (x, y) = (n.x, n.y);

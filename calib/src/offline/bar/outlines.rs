@@ -7,6 +7,7 @@ use crate::offline::contour::{Contour, ContourPoint, ViewEdges};
 use crate::offline::rim::circle::frame_of;
 use crate::offline::rim::cone::project;
 use crate::offline::rim::model::Projection;
+use graspd_rt::geom::Pixel;
 use nalgebra::Vector3;
 
 /// Strength of an edge that is half believed, in parts of the median along the clicked outline.
@@ -60,18 +61,18 @@ impl<'a, 'b> View<'a, 'b> {
             }
             seen += 1;
             let mut best = (0.0, None);
-            for (k, e) in self.edges.map.near(raw, tolerance.ceil() as i32) {
-                let Some(i) = self.edges.arcs.ideal.get(k) else { continue };
+            self.edges.map.near(raw, tolerance.ceil() as i32).for_each(|(k, e)| {
+                let Some(i) = self.edges.arcs.ideal.get(k) else { return };
                 let d = i.at - p.at;
                 let off = d.dot(&p.normal).abs() / tolerance;
                 if i.towards_bright.dot(&p.normal).abs() <= ALIGNED || off > 1.0 || d.norm() > tolerance + 1.5 {
-                    continue;
+                    return;
                 }
                 let worth = e.strength / (e.strength + self.half) * (1.0 - 0.5 * off * off);
                 if worth > best.0 {
                     best = (worth, Some(k as u32));
                 }
-            }
+            });
             sum += best.0;
             hits.push(best.1);
         }
@@ -80,39 +81,65 @@ impl<'a, 'b> View<'a, 'b> {
 
     /// Places along the outer and the inner outline where they are not hidden by the bar itself.
     pub(in crate::offline::bar) fn outlines(&self, torus: &Torus, corners: usize, step: f64) -> [Vec<Place>; 2] {
-        let mut curves = [Vec::with_capacity(corners), Vec::with_capacity(corners)];
-        for k in 0..corners {
+        let bar = Bar::new(torus, &self.eye);
+        [0, 1].map(|k| self.places(&bar, k, corners, step))
+    }
+
+    /// The same along one of them: 0 is the outer one.
+    fn places(&self, bar: &Bar<'_>, which: usize, corners: usize, step: f64) -> Vec<Place> {
+        let corner = |k: usize| {
             let angle = std::f64::consts::TAU * k as f64 / corners as f64;
-            let both = outline(torus, &self.eye, angle);
-            for (i, curve) in curves.iter_mut().enumerate() {
-                let x = both.map(|b| b[i]).filter(|x| !hidden(torus, &self.eye, x, angle));
-                curve.push(x.map(|x| project(self.p, &x)).filter(|u| u.iter().all(|v| v.is_finite())));
-            }
-        }
-        let middle = project(self.p, &torus.centre);
-        curves.map(|c| places(&c, step, middle))
+            let x = *outline(bar.torus, bar.eye, angle)?.get(which)?;
+            let u = project(self.p, &x);
+            (!bar.hides(&x, angle) && u.iter().all(|v| v.is_finite())).then_some(u)
+        };
+        let curve: Vec<Option<Pixel>> = (0..corners).map(corner).collect();
+        places(&curve, step, project(self.p, &bar.torus.centre))
     }
 }
 
-/// Whether another part of the bar stands before a point of its outline at a core angle.
-fn hidden(torus: &Torus, eye: &Vector3<f64>, x: &Vector3<f64>, angle: f64) -> bool {
-    const AROUND: usize = 48;
-    let sight = x - eye;
-    let reach = sight.norm();
-    let d = sight / reach;
-    let f = frame_of(&torus.normal);
-    let own = 3.0 * torus.bar / torus.core;
-    (0..AROUND).any(|k| {
-        let a = std::f64::consts::TAU * k as f64 / AROUND as f64;
-        let apart = (a - angle + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU) - std::f64::consts::PI;
-        if apart.abs() < own {
-            return false;
-        }
-        let c = torus.centre + (f.column(0) * a.cos() + f.column(1) * a.sin()) * torus.core - eye;
-        let along = c.dot(&d);
+/// Points of the core at which a bar may stand before its own outline.
+const AROUND: usize = 48;
+
+/// A bar seen from a place.
+struct Bar<'a> {
+    torus: &'a Torus,
+    eye: &'a Vector3<f64>,
+    /// Points of the core from the eye, with their squared distance.
+    core: [(Vector3<f64>, f64); AROUND],
+}
+
+impl<'a> Bar<'a> {
+    fn new(torus: &'a Torus, eye: &'a Vector3<f64>) -> Self {
+        let f = frame_of(&torus.normal);
+        let core = std::array::from_fn(|k| {
+            let (sin, cos) = Self::angle(k).sin_cos();
+            let c = torus.centre + (f.column(0) * cos + f.column(1) * sin) * torus.core - eye;
+            (c, c.norm_squared())
+        });
+        Self { torus, eye, core }
+    }
+
+    fn angle(k: usize) -> f64 {
+        std::f64::consts::TAU * k as f64 / AROUND as f64
+    }
+
+    /// Whether another part of the bar stands before a point of its outline at a core angle.
+    fn hides(&self, x: &Vector3<f64>, angle: f64) -> bool {
+        let sight = x - self.eye;
+        let reach = sight.norm();
+        let d = sight / reach;
         // The chord between two of the core's points strays from it by a little.
-        along < reach && (c - d * along).norm() < 0.97 * torus.bar
-    })
+        let near = (0.97 * self.torus.bar).powi(2);
+        let own = 3.0 * self.torus.bar / self.torus.core;
+        self.core.iter().enumerate().any(|(k, (c, square))| {
+            let along = c.dot(&d);
+            along < reach && square - along * along < near && {
+                let apart = (Self::angle(k) - angle).abs();
+                apart.min(std::f64::consts::TAU - apart) >= own
+            }
+        })
+    }
 }
 
 /// How much of the other outline carries edges, the worse view counting most: whatever edges, and by how likely they are an outline.
@@ -124,8 +151,7 @@ pub(in crate::offline::bar) fn support(
 ) -> (f64, f64) {
     let (mut least, mut sum) = ([f64::INFINITY; 2], [0.0; 2]);
     for v in views {
-        let [outer, inner] = v.outlines(t, TESTED, 0.0);
-        let other = if clicked_outer { inner } else { outer };
+        let other = v.places(&Bar::new(t, &v.eye), usize::from(clicked_outer), TESTED, 0.0);
         let (likely, hits) = v.outline_edges(&other, tolerance);
         let any = hits.iter().flatten().count() as f64 / hits.len().max(1) as f64;
         for (k, c) in [any, likely].into_iter().enumerate() {

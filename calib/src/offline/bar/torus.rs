@@ -7,6 +7,7 @@ use crate::offline::rim::circle::frame_of;
 use crate::offline::rim::cone::camera_centre;
 use crate::offline::rim::model::{EdgePoint, Projection};
 use nalgebra::{SMatrix, SVector, Vector3};
+use std::cell::RefCell;
 
 /// A torus: core circle and bar.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -80,36 +81,43 @@ impl Torus {
     }
 
     /// Closest approach by at most 12 guarded Newton steps from the angle at which the ray pierces the plane.
+    ///
+    /// The angle is never needed, only its sine and cosine, which a step turns; and of the vectors only their parts along the plane's axes.
     fn closest(&self, ray: &Ray, axes: &Axes) -> Option<Closest> {
+        let core = self.core;
         let down = ray.direction.dot(&self.normal);
         let to = self.centre - ray.origin;
         let reach = if down.abs() > 0.02 { to.dot(&self.normal) / down } else { to.dot(&ray.direction) };
         let x = ray.origin + ray.direction * reach - self.centre;
-        let mut u = x.dot(&axes.e2).atan2(x.dot(&axes.e1));
+        let (x1, x2) = (x.dot(&axes.e1), x.dot(&axes.e2));
+        let size = (x1 * x1 + x2 * x2).sqrt();
+        let (mut c, mut s) = if size > 0.0 { (x1 / size, x2 / size) } else { (1.0, 0.0) };
         let perpendicular = |v: &Vector3<f64>| v - ray.direction * ray.direction.dot(v);
+        let (d1, d2) = (ray.direction.dot(&axes.e1), ray.direction.dot(&axes.e2));
+        let across = perpendicular(&to);
+        let (q1, q2) = (across.dot(&axes.e1), across.dot(&axes.e2));
         for _ in 0..12 {
-            let (s, c) = u.sin_cos();
-            let e = axes.e1 * c + axes.e2 * s;
-            let t = (axes.e2 * c - axes.e1 * s) * self.core;
-            let v = perpendicular(&(to + e * self.core));
-            let along = ray.direction.dot(&t);
-            let slope = v.dot(&t);
-            let bend = t.norm_squared() - along * along - v.dot(&e) * self.core;
-            let step = if bend > 1e-3 * self.core * self.core { -slope / bend } else { -0.1 * slope.signum() };
+            // The ray's direction and the way to it, along the core point's direction e and along the core's tangent there.
+            let (de, dt) = (d1 * c + d2 * s, d2 * c - d1 * s);
+            let (qe, qt) = (q1 * c + q2 * s, q2 * c - q1 * s);
+            let slope = core * (qt - core * de * dt);
+            let bend = core * (core * (de * de - dt * dt) - qe);
+            let step = if bend > 1e-3 * core * core { -slope / bend } else { -0.1 * slope.signum() };
             let step = step.clamp(-0.3, 0.3);
-            u += step;
+            let (sin, cos) = sin_cos_of_step(step);
+            (c, s) = (c * cos - s * sin, s * cos + c * sin);
             if step.abs() < 1e-10 {
                 break;
             }
         }
-        let (s, c) = u.sin_cos();
         let e = axes.e1 * c + axes.e2 * s;
-        let core = to + e * self.core;
+        let core = to + e * core;
         let v = perpendicular(&core);
         let distance = v.norm();
         let w = -v / distance;
         let depth = ray.direction.dot(&core);
-        let slope = depth * w.dot(&ray.per_pixel[0]).hypot(w.dot(&ray.per_pixel[1]));
+        let (u, v) = (w.dot(&ray.per_pixel[0]), w.dot(&ray.per_pixel[1]));
+        let slope = depth * (u * u + v * v).sqrt();
         (distance > 0.0 && slope > 0.0 && slope.is_finite()).then_some(Closest { e, w, distance, slope })
     }
 
@@ -117,6 +125,15 @@ impl Torus {
     pub(crate) fn residual(&self, ray: &Ray) -> f64 {
         self.closest(ray, &self.axes()).map_or(f64::NAN, |c| (c.distance - self.bar) / c.slope)
     }
+}
+
+/// Sine and cosine of an angle of at most 0.3 by its series, to the last digit.
+fn sin_cos_of_step(x: f64) -> (f64, f64) {
+    let y = x * x;
+    let sin = 1.0 - y / 6.0 * (1.0 - y / 20.0 * (1.0 - y / 42.0 * (1.0 - y / 72.0 * (1.0 - y / 110.0))));
+    let cos =
+        1.0 - y / 2.0 * (1.0 - y / 12.0 * (1.0 - y / 30.0 * (1.0 - y / 56.0 * (1.0 - y / 90.0 * (1.0 - y / 132.0)))));
+    (x * sin, cos)
 }
 
 /// Which of the torus' parameters are adjusted.
@@ -146,11 +163,44 @@ pub(crate) struct TorusFit {
 /// The least-squares problem with the pixel scale of every ray held: repeated until the scales stand still.
 struct Fit<'a> {
     rays: &'a [Ray],
-    keep: &'a [bool],
     /// `1 / (sigma slope)` of each ray: turns a distance into a residual in units of sigma.
     weight: &'a [f64],
     unit: f64,
     free: Free,
+    /// Where the rays come closest to the last torus asked for: a step is first tried, then linearised at the same place.
+    closest: &'a RefCell<Approach>,
+}
+
+/// A torus and where every ray comes closest to its core.
+struct Approach {
+    torus: Torus,
+    axes: Axes,
+    closest: Vec<Closest>,
+    /// Whether all do.
+    whole: bool,
+}
+
+impl Approach {
+    fn new(rays: &[Ray], torus: &Torus) -> Self {
+        let mut new = Self { torus: *torus, axes: torus.axes(), closest: Vec::with_capacity(rays.len()), whole: false };
+        new.fill(rays);
+        new
+    }
+
+    fn fill(&mut self, rays: &[Ray]) {
+        self.closest.clear();
+        self.closest.extend(rays.iter().map_while(|r| self.torus.closest(r, &self.axes)));
+        self.whole = self.closest.len() == rays.len();
+    }
+
+    /// Moves to another torus; `None` where a ray has no closest place.
+    fn at(&mut self, rays: &[Ray], torus: &Torus) -> Option<(&Axes, &[Closest])> {
+        if self.torus != *torus {
+            (self.torus, self.axes) = (*torus, torus.axes());
+            self.fill(rays);
+        }
+        self.whole.then_some((&self.axes, &self.closest))
+    }
 }
 
 impl Problem<7> for Fit<'_> {
@@ -165,61 +215,44 @@ impl Problem<7> for Fit<'_> {
     }
 
     fn linearise(&self, x: &Torus) -> Option<Linear<7>> {
-        let axes = x.axes();
+        let mut approach = self.closest.borrow_mut();
+        let (axes, closest) = approach.at(self.rays, x)?;
         let n = self.parameters();
-        let mut out = Linear { cost: 0.0, gradient: SVector::zeros(), normal: SMatrix::zeros() };
-        for ((ray, keep), weight) in self.rays.iter().zip(self.keep).zip(self.weight) {
-            if !keep {
-                continue;
-            }
-            let c = x.closest(ray, &axes)?;
+        let mut cost = 0.0;
+        let mut gradient = [0.0; 7];
+        // All seven, whatever is free: loops of known length are quicker than fewer turns.
+        let mut normal = [[0.0; 7]; 7];
+        for (c, weight) in closest.iter().zip(self.weight) {
             let r = (c.distance - x.bar) * weight;
             // The foot's own motion does not count: it is the closest point (envelope theorem).
             let k = self.unit * weight;
             let tip = x.core * c.w.dot(&x.normal) * weight;
-            let mut j = SVector::<f64, 7>::zeros();
-            for i in 0..3 {
-                j[i] = -c.w[i] * k;
-            }
-            j[3] = tip * axes.e1.dot(&c.e);
-            j[4] = tip * axes.e2.dot(&c.e);
-            match self.free {
-                Free::All => {
-                    j[5] = -c.w.dot(&c.e) * k;
-                    j[6] = -k;
-                }
-                Free::KnownBar => j[5] = -c.w.dot(&c.e) * k,
-                Free::OneView => j[5] = -k,
-                Free::Pose => {}
-            }
-            out.cost += r * r;
-            for a in 0..n {
-                out.gradient[a] += j[a] * r;
-                for b in 0..=a {
-                    out.normal[(a, b)] += j[a] * j[b];
-                }
+            let (by_core, by_bar) = (-c.w.dot(&c.e) * k, -k);
+            let (radius, bar) = match self.free {
+                Free::All => (by_core, by_bar),
+                Free::KnownBar => (by_core, 0.0),
+                Free::OneView => (by_bar, 0.0),
+                Free::Pose => (0.0, 0.0),
+            };
+            let (tip1, tip2) = (tip * axes.e1.dot(&c.e), tip * axes.e2.dot(&c.e));
+            let j = [-c.w.x * k, -c.w.y * k, -c.w.z * k, tip1, tip2, radius, bar];
+            cost += r * r;
+            for ((g, row), a) in gradient.iter_mut().zip(&mut normal).zip(&j) {
+                *g += a * r;
+                row.iter_mut().zip(&j).for_each(|(m, b)| *m += a * b);
             }
         }
-        for a in 0..n {
-            for b in a + 1..n {
-                out.normal[(a, b)] = out.normal[(b, a)];
-            }
-        }
-        Some(out)
+        let normal = SMatrix::from_fn(|a, b| if a < n && b < n { normal[a][b] } else { 0.0 });
+        Some(Linear { cost, gradient: SVector::from(gradient), normal })
     }
 
     fn cost(&self, x: &Torus) -> Option<f64> {
         if !(x.core > 0.0 && x.bar > 0.0 && x.bar < 0.95 * x.core) {
             return None;
         }
-        let axes = x.axes();
-        let mut cost = 0.0;
-        for ((ray, keep), weight) in self.rays.iter().zip(self.keep).zip(self.weight) {
-            if *keep {
-                let r = (x.closest(ray, &axes)?.distance - x.bar) * weight;
-                cost += r * r;
-            }
-        }
+        let mut approach = self.closest.borrow_mut();
+        let (_, closest) = approach.at(self.rays, x)?;
+        let cost: f64 = closest.iter().zip(self.weight).map(|(c, w)| (c.distance - x.bar) * w).map(|r| r * r).sum();
         cost.is_finite().then_some(cost)
     }
 
@@ -243,14 +276,18 @@ impl Problem<7> for Fit<'_> {
 
 /// Fits a torus to rays from a start.
 pub(crate) fn fit(rays: &[Ray], keep: &[bool], start: &Torus, free: Free) -> Option<TorusFit> {
+    let rays: Vec<Ray> = rays.iter().zip(keep).filter(|(_, k)| **k).map(|(r, _)| *r).collect();
     let unit = start.core;
     let mut torus = *start;
     let mut found = None;
+    let approach = RefCell::new(Approach::new(&rays, start));
     for _ in 0..6 {
-        let axes = torus.axes();
-        let weight: Vec<f64> =
-            rays.iter().map(|r| torus.closest(r, &axes).map_or(0.0, |c| 1.0 / (r.sigma * c.slope))).collect();
-        let problem = Fit { rays, keep, weight: &weight, unit, free };
+        let weight: Vec<f64> = {
+            let mut approach = approach.borrow_mut();
+            let (_, closest) = approach.at(&rays, &torus)?;
+            closest.iter().zip(&rays).map(|(c, r)| 1.0 / (r.sigma * c.slope)).collect()
+        };
+        let problem = Fit { rays: &rays, weight: &weight, unit, free, closest: &approach };
         let minimum = levenberg::minimise(&problem, torus, 40)?;
         let moved = (minimum.state.centre - torus.centre).norm() / unit + (minimum.state.normal - torus.normal).norm();
         torus = minimum.state;
@@ -267,15 +304,10 @@ pub(crate) fn fit(rays: &[Ray], keep: &[bool], start: &Torus, free: Free) -> Opt
     }
     // The last scales belong to the state before the last: the cost that counts is the one in pixels at the end.
     if let Some(f) = &mut found {
-        let axes = f.torus.axes();
-        f.chi2 = 0.0;
-        for (ray, keep) in rays.iter().zip(keep) {
-            if *keep {
-                let c = f.torus.closest(ray, &axes)?;
-                let r = (c.distance - f.torus.bar) / (ray.sigma * c.slope);
-                f.chi2 += r * r;
-            }
-        }
+        let mut approach = approach.borrow_mut();
+        let (_, closest) = approach.at(&rays, &f.torus)?;
+        let residual = |(c, r): (&Closest, &Ray)| (c.distance - f.torus.bar) / (r.sigma * c.slope);
+        f.chi2 = closest.iter().zip(&rays).map(residual).map(|r| r * r).sum();
     }
     found
 }
@@ -292,10 +324,12 @@ pub fn outline(torus: &Torus, eye: &Vector3<f64>, angle: f64) -> Option<[Vector3
     if !(h > torus.bar) {
         return None;
     }
-    let (middle, half) = (b.atan2(a), (-torus.bar / h).acos());
-    let mut v = [middle + half, middle - half];
-    if v[1].cos() > v[0].cos() {
+    // Cosine and sine of `atan2(b, a)` plus and minus `acos(-r / h)`.
+    let ((sm, cm), ch) = ((b / h, a / h), -torus.bar / h);
+    let sh = (1.0 - ch * ch).max(0.0).sqrt();
+    let mut v = [(cm * ch - sm * sh, sm * ch + cm * sh), (cm * ch + sm * sh, sm * ch - cm * sh)];
+    if v[1].0 > v[0].0 {
         v.swap(0, 1);
     }
-    Some(v.map(|v| torus.centre + e * (torus.core + torus.bar * v.cos()) + torus.normal * (torus.bar * v.sin())))
+    Some(v.map(|(cos, sin)| torus.centre + e * (torus.core + torus.bar * cos) + torus.normal * (torus.bar * sin)))
 }

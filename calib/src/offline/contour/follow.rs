@@ -5,7 +5,7 @@
 
 use crate::offline::contour::quick_fit::{Sums, Walk};
 use crate::offline::contour::{Contour, ContourPoint, FLOOR_PX, INDEPENDENT_PX, LEAST_COVERAGE, ViewEdges};
-use crate::offline::edges::{Refined, refine};
+use crate::offline::edges::Refined;
 use crate::offline::rim::model::{EdgePoint, Outline};
 use graspd_rt::geom::Pixel;
 
@@ -75,8 +75,8 @@ impl ViewEdges<'_> {
             }
             out.seen += 1;
             let mut best = (tolerance, None);
-            for (k, _) in self.map.near(raw, tolerance.ceil() as i32) {
-                let Some(i) = self.arcs.ideal.get(k) else { continue };
+            self.map.near(raw, tolerance.ceil() as i32).for_each(|(k, _)| {
+                let Some(i) = self.arcs.ideal.get(k) else { return };
                 let d = i.at - p.at;
                 let along = i.towards_bright.dot(&p.normal);
                 let side_fits = bright_inside.is_none_or(|inside| (along < 0.0) == inside);
@@ -84,7 +84,7 @@ impl ViewEdges<'_> {
                 if side_fits && along.abs() > 0.93 && off < best.0 && d.norm() < tolerance + 1.5 {
                     best = (off, Some(k as u32));
                 }
-            }
+            });
             out.hits.push(best.1);
         }
         out
@@ -117,7 +117,7 @@ impl ViewEdges<'_> {
         for (h, p) in support.hits.iter().zip(&seen) {
             let Some(k) = h.filter(|k| used.insert(*k)) else { continue };
             let Some(edge) = self.map.edges().get(k as usize) else { continue };
-            let Some(r) = refine(self.picture, edge, self.map.noise()) else {
+            let Some(r) = self.refine(k) else {
                 rejected.push(edge.at);
                 continue;
             };

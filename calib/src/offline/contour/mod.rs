@@ -5,11 +5,13 @@
 //! they stop changing, then the edges in a narrow band are taken by consensus, thinned to independent ones and refined.
 
 pub(in crate::offline) mod follow;
+mod grow;
 pub(in crate::offline) mod quick_fit;
 pub mod select;
 mod through;
 
-use crate::offline::contour::quick_fit::{Sums, Walk};
+use crate::offline::contour::grow::Trial;
+use crate::offline::contour::quick_fit::{Sums, Turn, Walk};
 use crate::offline::edges::arcs::Arcs;
 use crate::offline::edges::lens::Lens;
 use crate::offline::edges::picture::Picture;
@@ -17,6 +19,8 @@ use crate::offline::edges::sharpen::{lens_blur, sharpen};
 use crate::offline::edges::{self, EdgeMap, Refined};
 use crate::offline::rim::model::{EdgePoint, Ellipse2, Outline};
 use graspd_rt::geom::{Camera, Pixel};
+use std::cell::{OnceCell, RefCell};
+use std::collections::HashMap;
 
 /// Edges closer together than this share most of their pixels (2 sqrt(pi) times the smoothing), so that they count as one.
 pub(in crate::offline) const INDEPENDENT_PX: f64 = 3.5;
@@ -42,7 +46,13 @@ pub struct ViewEdges<'a> {
     samples: Vec<Vec<u32>>,
     /// Arcs by falling length.
     longest: Vec<u32>,
-    blur: std::cell::OnceCell<f64>,
+    blur: OnceCell<f64>,
+    /// Sines and cosines for walking round trial ellipses.
+    turn: Turn,
+    /// Edges brought to their place, by index: contours that compete share most of theirs.
+    refined: RefCell<HashMap<u32, Option<Refined>>>,
+    /// Contours with what became of them when their edges were told apart: each is paired with several of the other view.
+    sharp: RefCell<Vec<(Contour, Contour)>>,
 }
 
 /// An edge point of a contour.
@@ -93,16 +103,6 @@ impl Contour {
     }
 }
 
-/// A trial ellipse and how well it is supported.
-#[derive(Clone, Debug)]
-pub(in crate::offline) struct Trial {
-    pub(in crate::offline) ellipse: Ellipse2,
-    pub(in crate::offline) bright_inside: bool,
-    pub(in crate::offline) coverage: f64,
-    pub(in crate::offline) score: f64,
-    hits: Vec<u32>,
-}
-
 impl<'a> ViewEdges<'a> {
     /// Detects and links the edges of a picture taken by this camera.
     pub fn new(picture: &'a Picture, camera: &Camera) -> Self {
@@ -120,161 +120,9 @@ impl<'a> ViewEdges<'a> {
             .collect();
         let mut longest: Vec<u32> = (0..arcs.arcs.len() as u32).collect();
         longest.sort_by_key(|k| std::cmp::Reverse(arcs.arcs.get(*k as usize).map_or(0, |a| a.edges.len())));
-        Self { picture, map, arcs, lens, samples, longest, blur: std::cell::OnceCell::new() }
-    }
-
-    /// Trial ellipses through a seed edge, best first, at most `keep` and no two alike.
-    pub(in crate::offline) fn trials(&self, seed: usize, keep: usize) -> Vec<Trial> {
-        let (Some(s), Some(own)) = (self.arcs.ideal.get(seed), self.arcs.of(seed)) else { return Vec::new() };
-        let Some(arc) = self.arcs.arcs.get(own) else { return Vec::new() };
-        if !s.at.x.is_finite() {
-            return Vec::new();
-        }
-        let place = arc.edges.iter().position(|k| *k as usize == seed).unwrap_or(0);
-        let blank = Sums::new(s.at, 100.0);
-        let piece = |half: usize| {
-            let mut sums = blank;
-            let (from, to) = (place.saturating_sub(half), (place + half + 1).min(arc.edges.len()));
-            let step = ((to - from) / 40).max(1);
-            for k in arc.edges.get(from..to).unwrap_or(&[]).iter().step_by(step) {
-                if let Some(e) = self.arcs.ideal.get(*k as usize) {
-                    sums.add(e.at, 1.0);
-                }
-            }
-            sums
-        };
-        let mut found: Vec<Trial> = Vec::new();
-        let mut offer = |t: Option<Trial>| {
-            if let Some(t) = t {
-                if found.len() < 4 * keep || found.iter().any(|f| f.score < t.score) {
-                    found.push(t);
-                    found.sort_by(|a, b| b.score.total_cmp(&a.score));
-                    found.truncate(4 * keep);
-                }
-            }
-        };
-        for half in [25, 50, 100, 200, 5000] {
-            offer(self.trial(&piece(half), seed));
-            if half > arc.edges.len() {
-                break;
-            }
-        }
-        let near = piece(60);
-        for k in self.longest.iter().take(1500) {
-            if *k as usize == own {
-                continue;
-            }
-            let Some(samples) = self.samples.get(*k as usize) else { continue };
-            if !self.could_join(s, samples) {
-                continue;
-            }
-            let mut sums = blank;
-            for e in samples.iter().filter_map(|k| self.arcs.ideal.get(*k as usize)) {
-                sums.add(e.at, 1.0);
-            }
-            offer(self.trial(&near.plus(&sums), seed));
-        }
-        let mut out: Vec<Trial> = Vec::new();
-        for t in found {
-            let Some(t) = self.settle(t, seed) else { continue };
-            if t.coverage >= 0.8 * LEAST_COVERAGE && !out.iter().any(|o| alike(&o.ellipse, &t.ellipse)) {
-                out.push(t);
-            }
-        }
-        out.sort_by(|a, b| b.score.total_cmp(&a.score));
-        out.truncate(keep);
-        out
-    }
-
-    /// Whether an arc could lie on one convex curve with the seed, the same side brighter.
-    fn could_join(&self, s: &crate::offline::edges::arcs::IdealEdge, samples: &[u32]) -> bool {
-        let (mut inside, mut outside) = (0, 0);
-        for e in [samples.first(), samples.get(samples.len() / 2), samples.last()].into_iter().flatten() {
-            let Some(e) = self.arcs.ideal.get(*e as usize) else { return false };
-            let d = e.at - s.at;
-            let (a, b) = (s.towards_bright.dot(&d), -e.towards_bright.dot(&d));
-            let slack = 2.0 + 0.03 * d.norm();
-            if a > -slack && b > -slack {
-                inside += 1;
-            }
-            if a < slack && b < slack {
-                outside += 1;
-            }
-        }
-        inside == 3 || outside == 3
-    }
-
-    /// The ellipse of some sums as a trial, if it passes the seed in the seed's direction.
-    fn trial(&self, sums: &Sums, seed: usize) -> Option<Trial> {
-        let e = sums.ellipse()?;
-        let s = self.arcs.ideal.get(seed)?;
-        let (d, n, _) = Walk::new(&e).measure(s.at);
-        let along = s.towards_bright.dot(&n);
-        if d.abs() > 2.5 || along.abs() < 0.9 {
-            return None;
-        }
-        self.judge(&e, along < 0.0, 3.0)
-    }
-
-    /// Judges an ellipse by the edges along it.
-    pub(in crate::offline) fn judge(&self, e: &Ellipse2, bright_inside: bool, tolerance: f64) -> Option<Trial> {
-        let most = 1.5 * self.map.width().max(self.map.height()) as f64;
-        if !(e.b > 4.0 && e.a < most && e.b > 0.04 * e.a) {
-            return None;
-        }
-        let w = Walk::new(e);
-        let sign = if bright_inside { -1.0 } else { 1.0 };
-        let parameters = w.parameters(3.0, 160);
-        let (mut seen, mut hits) = (0usize, Vec::new());
-        for t in &parameters {
-            let (p, n) = w.at(*t);
-            let raw = self.lens.raw(p);
-            if !self.picture.contains(raw, 6.0) {
-                continue;
-            }
-            seen += 1;
-            let mut best = (tolerance, None);
-            for (k, _) in self.map.near(raw, tolerance.ceil() as i32) {
-                let Some(i) = self.arcs.ideal.get(k) else { continue };
-                let d = i.at - p;
-                if i.towards_bright.dot(&n) * sign > 0.94 && d.dot(&n).abs() < best.0 && d.norm() < tolerance + 1.5 {
-                    best = (d.dot(&n).abs(), Some(k as u32));
-                }
-            }
-            hits.extend(best.1);
-        }
-        if seen * 5 < parameters.len() * 2 {
-            return None;
-        }
-        let coverage = hits.len() as f64 / seen.max(1) as f64;
-        let score = coverage * coverage * w.perimeter().sqrt();
-        Some(Trial { ellipse: *e, bright_inside, coverage, score, hits })
-    }
-
-    /// Fits a trial again to the edges it gathered until it stops changing; it must go on passing the seed.
-    fn settle(&self, start: Trial, seed: usize) -> Option<Trial> {
-        let s = self.arcs.ideal.get(seed)?;
-        let mut best = start;
-        for k in 0..6 {
-            let mut sums = Sums::new(best.ellipse.centre, best.ellipse.a);
-            for e in best.hits.iter().filter_map(|k| self.arcs.ideal.get(*k as usize)) {
-                sums.add(e.at, 1.0);
-            }
-            // The seed and its neighbourhood hold the ellipse to the contour that was meant.
-            sums.add(s.at, 0.1 * best.hits.len() as f64);
-            let Some(e) = sums.ellipse() else { break };
-            let Some(t) = self.judge(&e, best.bright_inside, if k < 2 { 3.0 } else { 2.0 }) else { break };
-            let (d, n, _) = Walk::new(&t.ellipse).measure(s.at);
-            if d.abs() > 2.0 || s.towards_bright.dot(&n).abs() < 0.9 {
-                break;
-            }
-            let same = alike(&t.ellipse, &best.ellipse) && t.hits.len() == best.hits.len();
-            best = t;
-            if same {
-                break;
-            }
-        }
-        Some(best)
+        let turn = Turn::new(grow::MOST_PLACES);
+        let (refined, sharp) = (RefCell::default(), RefCell::default());
+        Self { picture, map, arcs, lens, samples, longest, blur: OnceCell::new(), turn, refined, sharp }
     }
 
     /// The contour of a trial: edges by consensus, thinned, refined, with their ellipse. `None` when too little is left.
@@ -317,12 +165,11 @@ impl<'a> ViewEdges<'a> {
         for t in w.parameters(1.5, 20_000) {
             let (p, n) = w.at(t);
             let raw = self.lens.raw(p);
-            for (k, _) in self.map.near(raw, 4) {
-                let Some(i) = self.arcs.ideal.get(k) else { continue };
-                if i.towards_bright.dot(&n) * sign > 0.9 {
+            self.map.near(raw, 4).for_each(|(k, _)| {
+                if self.arcs.ideal.get(k).is_some_and(|i| i.towards_bright.dot(&n) * sign > 0.9) {
                     band.push(k as u32);
                 }
-            }
+            });
         }
         band.sort_unstable();
         band.dedup();
@@ -358,8 +205,7 @@ impl<'a> ViewEdges<'a> {
         }
         let mut points: Vec<ContourPoint> = Vec::new();
         for (_, k) in chosen.iter().flatten() {
-            let Some(edge) = self.map.edges().get(*k as usize) else { continue };
-            let Some(r) = edges::refine(self.picture, edge, self.map.noise()) else { continue };
+            let Some(r) = self.refine(*k) else { continue };
             let Some(ideal) = self.lens.ideal(r.at) else { continue };
             let (_, n, t) = w.measure(ideal);
             // Lens distortion turns the normal by far less than matters for a shift of hundredths of a pixel.
@@ -372,6 +218,16 @@ impl<'a> ViewEdges<'a> {
         points_on_one_ellipse(points, e, sign < 0.0, bins, rejected)
     }
 
+    /// An edge point brought to its place (see [`edges::refine`]), once.
+    pub(in crate::offline) fn refine(&self, k: u32) -> Option<Refined> {
+        if let Some(known) = self.refined.borrow().get(&k) {
+            return *known;
+        }
+        let r = self.map.edges().get(k as usize).and_then(|e| edges::refine(self.picture, e, self.map.noise()));
+        self.refined.borrow_mut().insert(k, r);
+        r
+    }
+
     /// Standard deviation of a sharp edge's picture, pixels; measured once.
     pub(in crate::offline) fn blur(&self) -> f64 {
         *self.blur.get_or_init(|| lens_blur(self.picture, &self.map))
@@ -379,6 +235,15 @@ impl<'a> ViewEdges<'a> {
 
     /// The same contour with every edge told apart from its neighbours (see [`crate::offline::edges::sharpen`]); the contour itself where too few can be.
     pub(in crate::offline) fn sharpened(&self, c: &Contour) -> Contour {
+        if let Some((_, known)) = self.sharp.borrow().iter().find(|(from, _)| from == c) {
+            return known.clone();
+        }
+        let sharp = self.sharpen(c);
+        self.sharp.borrow_mut().push((c.clone(), sharp.clone()));
+        sharp
+    }
+
+    fn sharpen(&self, c: &Contour) -> Contour {
         let blur = self.blur();
         let w = Walk::new(&c.ellipse);
         let sign = if c.bright_inside { -1.0 } else { 1.0 };

@@ -108,6 +108,10 @@ impl Walk {
     /// Point and outward unit normal at the parameter `t`.
     pub(in crate::offline) fn at(&self, t: f64) -> (Pixel, Pixel) {
         let (s, c) = t.sin_cos();
+        self.at_sin_cos(s, c)
+    }
+
+    fn at_sin_cos(&self, s: f64, c: f64) -> (Pixel, Pixel) {
         let n = self.out(self.e.b * c, self.e.a * s);
         (self.e.centre + self.out(self.e.a * c, self.e.b * s), n / n.norm().max(1e-12))
     }
@@ -139,20 +143,64 @@ impl Walk {
 
     /// Parameters at equal arc lengths of about `step` pixels.
     pub(in crate::offline) fn parameters(&self, step: f64, most: usize) -> Vec<f64> {
-        let n = ((self.perimeter() / step) as usize).clamp(16, most.max(16));
-        let fine = 4 * n;
-        let speed = |t: f64| ((self.e.a * t.sin()).powi(2) + (self.e.b * t.cos()).powi(2)).sqrt();
-        let dt = std::f64::consts::TAU / fine as f64;
-        let total: f64 = (0..fine).map(|k| speed((k as f64 + 0.5) * dt)).sum();
+        let n = self.count(step, most);
+        self.evenly(n, &Turn::new(n)).into_iter().map(|p| p.t).collect()
+    }
+
+    /// Points and outward unit normals at equal arc lengths of about `step` pixels. A turn made for `most` places is used where it fits.
+    pub(in crate::offline) fn places(&self, step: f64, most: usize, turn: &Turn) -> Vec<(Pixel, Pixel)> {
+        let n = self.count(step, most);
+        let own = if turn.n == n { None } else { Some(Turn::new(n)) };
+        let places = self.evenly(n, own.as_ref().unwrap_or(turn));
+        places.into_iter().map(|p| self.at_sin_cos(p.sin, p.cos)).collect()
+    }
+
+    fn count(&self, step: f64, most: usize) -> usize {
+        ((self.perimeter() / step) as usize).clamp(16, most.max(16))
+    }
+
+    fn evenly(&self, n: usize, turn: &Turn) -> Vec<Parameter> {
+        let mut length = Vec::with_capacity(turn.fine.len());
+        length.extend(turn.fine.iter().map(|p| ((self.e.a * p.sin).powi(2) + (self.e.b * p.cos).powi(2)).sqrt()));
+        let mut total = 0.0;
+        for l in &mut length {
+            total += *l;
+            *l = total;
+        }
         let mut out = Vec::with_capacity(n);
-        let mut done = 0.0;
-        for k in 0..fine {
-            done += speed((k as f64 + 0.5) * dt);
-            if done >= total * (out.len() as f64 + 0.5) / n as f64 && out.len() < n {
-                out.push((k as f64 + 0.5) * dt);
+        for (done, p) in length.iter().zip(&turn.fine) {
+            if *done >= total * (out.len() as f64 + 0.5) / n as f64 && out.len() < n {
+                out.push(*p);
             }
         }
         out
+    }
+}
+
+/// A parameter with its sine and cosine.
+#[derive(Clone, Copy, Debug)]
+struct Parameter {
+    t: f64,
+    sin: f64,
+    cos: f64,
+}
+
+/// The steps of a walk once round with a number of places.
+#[derive(Clone, Debug)]
+pub(in crate::offline) struct Turn {
+    n: usize,
+    fine: Vec<Parameter>,
+}
+
+impl Turn {
+    pub(in crate::offline) fn new(n: usize) -> Self {
+        let dt = std::f64::consts::TAU / (4 * n) as f64;
+        let fine = (0..4 * n).map(|k| {
+            let t = (k as f64 + 0.5) * dt;
+            let (sin, cos) = t.sin_cos();
+            Parameter { t, sin, cos }
+        });
+        Self { n, fine: fine.collect() }
     }
 }
 

@@ -1,8 +1,9 @@
 //! Edge points linked to chains, and chains cut into arcs that could belong to one ellipse.
 
-use crate::offline::edges::EdgeMap;
 use crate::offline::edges::lens::Lens;
+use crate::offline::edges::{Edge, EdgeMap};
 use graspd_rt::geom::Pixel;
+use std::cell::Cell;
 
 /// Arcs shorter than this say nothing.
 const SHORTEST: usize = 8;
@@ -33,7 +34,43 @@ pub struct Arcs {
     /// Arc of each edge point, as index + 1; 0 for none.
     arc_of: Vec<u32>,
     /// Every edge point in ideal pixels; points where the lens has no inverse stand at NaN.
-    pub ideal: Vec<IdealEdge>,
+    pub ideal: IdealEdges,
+}
+
+/// The edge points of a picture in ideal pixels. Most are never asked for, so each is undistorted when it is for the first time.
+#[derive(Clone, Debug)]
+pub struct IdealEdges {
+    lens: Lens,
+    edges: Vec<Cell<Undistorted>>,
+}
+
+/// An edge point before and after.
+#[derive(Clone, Copy, Debug)]
+enum Undistorted {
+    NotYet(IdealEdge),
+    Done(IdealEdge),
+}
+
+impl IdealEdges {
+    fn new(map: &EdgeMap, lens: &Lens) -> Self {
+        let raw = |e: &Edge| IdealEdge { at: e.at, towards_bright: e.towards_bright };
+        Self { lens: *lens, edges: map.edges().iter().map(|e| Cell::new(Undistorted::NotYet(raw(e)))).collect() }
+    }
+
+    /// An edge point by its index in the edge map.
+    pub fn get(&self, edge: usize) -> Option<IdealEdge> {
+        let slot = self.edges.get(edge)?;
+        match slot.get() {
+            Undistorted::Done(ideal) => Some(ideal),
+            Undistorted::NotYet(raw) => {
+                let at = self.lens.ideal(raw.at).unwrap_or(Pixel::new(f64::NAN, f64::NAN));
+                let towards_bright = self.lens.ideal_direction(raw.at, at, raw.towards_bright);
+                let ideal = IdealEdge { at, towards_bright };
+                slot.set(Undistorted::Done(ideal));
+                Some(ideal)
+            }
+        }
+    }
 }
 
 impl Arcs {
@@ -41,14 +78,7 @@ impl Arcs {
     pub fn link(map: &EdgeMap, lens: &Lens) -> Self {
         let (next, previous) = links(map);
         let n = map.edges().len();
-        let ideal = map
-            .edges()
-            .iter()
-            .map(|e| {
-                let at = lens.ideal(e.at).unwrap_or(Pixel::new(f64::NAN, f64::NAN));
-                IdealEdge { at, towards_bright: lens.ideal_direction(e.at, at, e.towards_bright) }
-            })
-            .collect();
+        let ideal = IdealEdges::new(map, lens);
         let mut out = Self { arcs: Vec::new(), arc_of: vec![0; n], ideal };
         let get = |v: &[u32], k: u32| v.get(k as usize).copied().unwrap_or(NONE);
         let mut done = vec![false; n];
@@ -153,15 +183,15 @@ fn links(map: &EdgeMap) -> (Vec<u32>, Vec<u32>) {
     for (i, e) in map.edges().iter().enumerate() {
         let t = Pixel::new(-e.towards_bright.y, e.towards_bright.x);
         let (mut best_a, mut best_b) = (f64::INFINITY, f64::INFINITY);
-        for (j, f) in map.near(e.at, 2) {
+        map.near(e.at, 2).for_each(|(j, f)| {
             if j == i || e.towards_bright.dot(&f.towards_bright) < 0.7 {
-                continue;
+                return;
             }
             let d = f.at - e.at;
             let along = d.dot(&t);
             let aside = d.dot(&e.towards_bright).abs();
             if aside > 0.6 * along.abs() + 0.3 || along.abs() < 0.2 {
-                continue;
+                return;
             }
             let cost = along.abs() + 2.0 * aside;
             let (best, slot) = if along > 0.0 { (&mut best_a, &mut ahead) } else { (&mut best_b, &mut behind) };
@@ -171,7 +201,7 @@ fn links(map: &EdgeMap) -> (Vec<u32>, Vec<u32>) {
                     *s = j;
                 }
             }
-        }
+        });
     }
     let mutual = |to: &[u32], back: &[u32]| -> Vec<u32> {
         to.iter()

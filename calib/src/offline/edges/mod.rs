@@ -7,10 +7,12 @@
 //! edge of width `w` (Mendonca), is removed by [`Refined::straightened`] once the curvature is known.
 
 pub mod arcs;
+mod gradient;
 pub mod lens;
 pub mod picture;
 pub mod sharpen;
 
+use crate::offline::edges::gradient::{GradientRow, GradientRows};
 use crate::offline::edges::picture::Picture;
 use graspd_rt::geom::Pixel;
 
@@ -30,14 +32,20 @@ pub struct Edge {
     pub strength: f64,
 }
 
-/// Every edge point of a picture, and which one lies in which pixel.
+/// Pixels of a row that share an entry of the index.
+const BLOCK: usize = 16;
+
+/// Every edge point of a picture, and which ones lie near a place.
 #[derive(Clone, Debug)]
 pub struct EdgeMap {
     width: usize,
     height: usize,
     edges: Vec<Edge>,
-    /// Index + 1 of the edge point found in each pixel, 0 for none.
-    grid: Vec<u32>,
+    /// Column of the pixel that each edge point was found in.
+    columns: Vec<u32>,
+    /// Index of the first edge point in or after each block, block by block in raster order, and the number of points at the end.
+    /// A picture has few edge points: a word for each pixel would be as large as all the rest, and cost its page faults.
+    starts: Vec<u32>,
     noise: f64,
 }
 
@@ -48,39 +56,55 @@ impl EdgeMap {
         // The gradient's own noise is noise / (sqrt(8 pi) SCALE^2); five times that is left to chance once in a million pixels.
         let threshold = (5.0 * noise / (8.0 * std::f64::consts::PI).sqrt() / (SCALE * SCALE)).max(1.2) as f32;
         let (w, h) = (picture.width(), picture.height());
-        let mut map = Self { width: w, height: h, edges: Vec::new(), grid: vec![0; w * h], noise };
-        if w < 2 * RADIUS + 3 || h < 2 * RADIUS + 3 {
-            return map;
-        }
-        let g = Gradient::of(picture);
-        for y in 1..h - 1 {
-            let m0 = g.strength_row(y - 1);
-            let m1 = g.strength_row(y);
-            let m2 = g.strength_row(y + 1);
-            let (gx, gy) = (g.x_row(y), g.y_row(y));
-            for x in 1..w - 1 {
-                let at = |r: &[f32], k: usize| r.get(k).copied().unwrap_or(0.0);
-                let m = at(m1, x);
-                if m < threshold {
-                    continue;
-                }
-                let (dx, dy) = (at(gx, x), at(gy, x));
-                let horizontal = dx.abs() >= dy.abs();
-                let (a, b) = if horizontal { (at(m1, x - 1), at(m1, x + 1)) } else { (at(m0, x), at(m2, x)) };
-                if !(m > a && m >= b) {
-                    continue;
-                }
-                let (a, b, m) = (f64::from(a), f64::from(b), f64::from(m));
-                let s = (0.5 * (a - b) / (a - 2.0 * m + b)).clamp(-0.5, 0.5);
-                let (u, v) = if horizontal { (s, 0.0) } else { (0.0, s) };
-                let n = Pixel::new(f64::from(dx), f64::from(dy)).normalize();
-                map.edges.push(Edge { at: Pixel::new(x as f64 + u, y as f64 + v), towards_bright: n, strength: m });
-                if let (Some(c), Ok(k)) = (map.grid.get_mut(y * w + x), u32::try_from(map.edges.len())) {
-                    *c = k;
-                }
+        let mut map = Self { width: w, height: h, edges: Vec::new(), columns: Vec::new(), starts: Vec::new(), noise };
+        if let Some(mut rows) = GradientRows::new(picture) {
+            while let Some((y, three)) = rows.step() {
+                map.scan(y, three, threshold);
             }
         }
+        map.index_to(h * w.div_ceil(BLOCK));
         map
+    }
+
+    /// Takes the edge points of a row from its gradient and its neighbours'.
+    fn scan(&mut self, y: usize, [above, row, below]: [&GradientRow; 3], threshold: f32) {
+        // A little lower than the threshold, so that only candidates need their root.
+        let candidate = threshold * threshold * 0.999;
+        for (i, square) in row.square.iter().enumerate() {
+            if *square < candidate {
+                continue;
+            }
+            let m = square.sqrt();
+            if m < threshold {
+                continue;
+            }
+            let at = |r: &[f32], k: usize| r.get(k).copied().unwrap_or(0.0);
+            let (dx, dy) = (at(&row.x, i), at(&row.y, i));
+            let horizontal = dx.abs() >= dy.abs();
+            let (a, b) = if horizontal {
+                (i.checked_sub(1).map_or(0.0, |k| at(&row.square, k)), at(&row.square, i + 1))
+            } else {
+                (at(&above.square, i), at(&below.square, i))
+            };
+            let (a, b) = (a.sqrt(), b.sqrt());
+            if !(m > a && m >= b) {
+                continue;
+            }
+            let (a, b, m) = (f64::from(a), f64::from(b), f64::from(m));
+            let s = (0.5 * (a - b) / (a - 2.0 * m + b)).clamp(-0.5, 0.5);
+            let (u, v) = if horizontal { (s, 0.0) } else { (0.0, s) };
+            let n = Pixel::new(f64::from(dx), f64::from(dy)).normalize();
+            let x = i + RADIUS;
+            self.index_to(y * self.width.div_ceil(BLOCK) + x / BLOCK);
+            self.edges.push(Edge { at: Pixel::new(x as f64 + u, y as f64 + v), towards_bright: n, strength: m });
+            self.columns.push(x as u32);
+        }
+    }
+
+    /// Ends every block up to and with the one before this, so that the next edge point lies in it.
+    fn index_to(&mut self, block: usize) {
+        let n = self.edges.len() as u32;
+        self.starts.resize(self.starts.len().max(block + 1), n);
     }
 
     /// The edge points in raster order.
@@ -103,112 +127,28 @@ impl EdgeMap {
         self.noise
     }
 
-    /// Index of the edge point found in a pixel.
-    #[inline]
-    pub fn in_pixel(&self, x: i32, y: i32) -> Option<usize> {
-        let (x, y) = (usize::try_from(x).ok()?, usize::try_from(y).ok()?);
-        if x >= self.width {
-            return None;
-        }
-        match self.grid.get(y * self.width + x) {
-            Some(&k) if k > 0 => Some(k as usize - 1),
-            _ => None,
-        }
-    }
-
-    /// Edge points found in the pixels at most `radius` away, with their index.
+    /// Edge points found in the pixels at most `radius` away, with their index, in raster order.
     pub fn near(&self, p: Pixel, radius: i32) -> impl Iterator<Item = (usize, &Edge)> {
-        let (cx, cy) = (p.x.round() as i32, p.y.round() as i32);
-        (cy.saturating_sub(radius)..=cy.saturating_add(radius))
-            .flat_map(move |y| (cx.saturating_sub(radius)..=cx.saturating_add(radius)).map(move |x| (x, y)))
-            .filter_map(|(x, y)| self.in_pixel(x, y))
-            .filter_map(|k| self.edges.get(k).map(|e| (k, e)))
-    }
-}
-
-/// First derivatives of the smoothed picture.
-struct Gradient {
-    w: usize,
-    x: Vec<f32>,
-    y: Vec<f32>,
-    strength: Vec<f32>,
-}
-
-impl Gradient {
-    fn of(p: &Picture) -> Self {
-        let (w, h) = (p.width(), p.height());
-        let (mut smooth, mut slope) = ([0f32; 2 * RADIUS + 1], [0f32; 2 * RADIUS + 1]);
-        let mut sum = 0.0;
-        for (i, s) in smooth.iter_mut().enumerate() {
-            let d = i as f32 - RADIUS as f32;
-            *s = (-0.5 * d * d / (SCALE * SCALE) as f32).exp();
-            sum += *s;
-        }
-        let mut gain = 0.0;
-        for (i, (s, t)) in smooth.iter_mut().zip(slope.iter_mut()).enumerate() {
-            let d = i as f32 - RADIUS as f32;
-            *s /= sum;
-            *t = d * *s;
-            gain += d * *t;
-        }
-        // A ramp of one grey level a pixel has slope exactly one.
-        slope.iter_mut().for_each(|t| *t /= gain);
-
-        let n = w * h;
-        let mut out = Self { w, x: vec![0.0; n], y: vec![0.0; n], strength: vec![0.0; n] };
-        let mut row = vec![0f32; w];
-        let mut across = (vec![0f32; n], vec![0f32; n]);
-        for (y, (s, t)) in across.0.chunks_exact_mut(w).zip(across.1.chunks_exact_mut(w)).enumerate() {
-            for (r, v) in row.iter_mut().zip(p.row(y)) {
-                *r = f32::from(*v);
-            }
-            convolve(&row, &smooth, s);
-            convolve(&row, &slope, t);
-        }
-        for y in RADIUS..h - RADIUS {
-            let o = y * w;
-            for k in 0..=2 * RADIUS {
-                let i = (y + k - RADIUS) * w;
-                let (sm, sl) = (smooth.get(k).copied().unwrap_or(0.0), slope.get(k).copied().unwrap_or(0.0));
-                if let (Some(dx), Some(src)) = (out.x.get_mut(o..o + w), across.1.get(i..i + w)) {
-                    dx.iter_mut().zip(src).for_each(|(d, s)| *d += sm * s);
-                }
-                if let (Some(dy), Some(src)) = (out.y.get_mut(o..o + w), across.0.get(i..i + w)) {
-                    dy.iter_mut().zip(src).for_each(|(d, s)| *d += sl * s);
-                }
-            }
-            let rows = (out.strength.get_mut(o..o + w), out.x.get(o..o + w), out.y.get(o..o + w));
-            if let (Some(m), Some(dx), Some(dy)) = rows {
-                for ((m, x), y) in m.iter_mut().zip(dx).zip(dy) {
-                    *m = (x * x + y * y).sqrt();
-                }
-            }
-        }
-        out
-    }
-
-    fn strength_row(&self, y: usize) -> &[f32] {
-        self.strength.get(y * self.w..(y + 1) * self.w).unwrap_or(&[])
-    }
-
-    fn x_row(&self, y: usize) -> &[f32] {
-        self.x.get(y * self.w..(y + 1) * self.w).unwrap_or(&[])
-    }
-
-    fn y_row(&self, y: usize) -> &[f32] {
-        self.y.get(y * self.w..(y + 1) * self.w).unwrap_or(&[])
-    }
-}
-
-/// Correlates a row with a kernel; the margin of one radius is left at zero.
-fn convolve(row: &[f32], kernel: &[f32; 2 * RADIUS + 1], out: &mut [f32]) {
-    let n = row.len().saturating_sub(2 * RADIUS);
-    let Some(middle) = out.get_mut(RADIUS..RADIUS + n) else { return };
-    middle.fill(0.0);
-    for (k, c) in kernel.iter().enumerate() {
-        if let Some(src) = row.get(k..k + n) {
-            middle.iter_mut().zip(src).for_each(|(o, v)| *o += c * v);
-        }
+        let span = |middle: f64, size: usize| {
+            let middle = middle.round() as i32;
+            let last = i32::try_from(size).unwrap_or(i32::MAX) - 1;
+            (middle.saturating_sub(radius).max(0), middle.saturating_add(radius).min(last))
+        };
+        let ((x0, x1), (y0, y1)) = (span(p.x, self.width), span(p.y, self.height));
+        // Empty where the picture does not reach.
+        let (x0, x1) = (x0 as u32, if x0 <= x1 { Some(x1 as u32) } else { None });
+        let blocks = self.width.div_ceil(BLOCK);
+        (y0..=y1).filter_map(move |y| Some((y as usize, x1?))).flat_map(move |(y, x1)| {
+            let start = |x: u32, more: usize| self.starts.get(y * blocks + x as usize / BLOCK + more);
+            let (from, to) = match (start(x0, 0), start(x1, 1)) {
+                (Some(a), Some(b)) => (*a as usize, *b as usize),
+                _ => (0, 0),
+            };
+            let columns = self.columns.get(from..to).unwrap_or(&[]);
+            let edges = self.edges.get(from..to).unwrap_or(&[]);
+            let inside = columns.iter().zip(edges).enumerate().filter(move |(_, (x, _))| x0 <= **x && **x <= x1);
+            inside.map(move |(k, (_, e))| (from + k, e))
+        })
     }
 }
 

@@ -54,11 +54,21 @@ pub struct Sight {
     pub all: bool,
 }
 
+/// A mark with the places at which it is held against what may hide it.
+struct FlatDisc<'a> {
+    mark: &'a Mark,
+    /// Centre and four points of its edge: a disc that is half hidden has its centre in the wrong place.
+    places: [Vec3; 5],
+    /// The same places in the frame of each of the gripper's boxes.
+    in_boxes: Vec<[Vec3; 5]>,
+}
+
 /// Everything that does not change from pose to pose.
 pub struct Scene<'a> {
     rig: &'a Rig,
-    gripper: &'a GripperFile,
-    boxes: Vec<OrientedBox>,
+    marks: Vec<FlatDisc<'a>>,
+    /// The gripper's frame in each box's, and the box's half sizes.
+    boxes: Vec<(Pose, Vec3)>,
     obstacle: Option<&'a dyn Obstacle>,
     eyes: [Vec3; 2],
 }
@@ -66,7 +76,18 @@ pub struct Scene<'a> {
 impl<'a> Scene<'a> {
     /// A rig, a gripper with its jaws this far open, and the object if it can hide marks.
     pub fn new(rig: &'a Rig, gripper: &'a GripperFile, opening: f64, obstacle: Option<&'a dyn Obstacle>) -> Self {
-        Self { rig, gripper, boxes: gripper.boxes(opening), obstacle, eyes: View::BOTH.map(|v| rig.centre(v)) }
+        let boxes: Vec<(Pose, Vec3)> =
+            gripper.boxes(opening).iter().map(|b| (b.frame_from_box.inverse(), b.half)).collect();
+        let disc = |mark: &'a Mark| {
+            let side = if mark.normal.x.abs() < 0.9 { Vec3::x() } else { Vec3::y() };
+            let e1 = mark.normal.cross(&side).normalize() * mark.radius;
+            let e2 = mark.normal.cross(&e1);
+            let places = [Vec3::zeros(), e1, -e1, e2, -e2].map(|d| mark.position + d);
+            let in_boxes = boxes.iter().map(|(from, _)| places.map(|p| (from * Point3::from(p)).coords)).collect();
+            FlatDisc { mark, places, in_boxes }
+        };
+        let marks = gripper.gripper.marks.iter().map(disc).collect();
+        Self { rig, marks, boxes, obstacle, eyes: View::BOTH.map(|v| rig.centre(v)) }
     }
 
     /// What a view sees of the gripper.
@@ -74,8 +95,13 @@ impl<'a> Scene<'a> {
         let eye = self.eyes.get(view.index()).copied().unwrap_or_default();
         let eye_in_gripper = left_from_gripper.inverse_transform_point(&Point3::from(eye)).coords;
         let mut out = Sight { pixels: [None; MAX_MARKS], solid_angle: 0.0, seen: 0, all: true };
-        for (slot, mark) in out.pixels.iter_mut().zip(&self.gripper.gripper.marks) {
-            *slot = self.mark(view, mark, left_from_gripper, &eye, &eye_in_gripper);
+        let eye_in_boxes: Vec<Vec3> =
+            self.boxes.iter().map(|(from, _)| (from * Point3::from(eye_in_gripper)).coords).collect();
+        for (slot, disc) in out.pixels.iter_mut().zip(&self.marks) {
+            let mark = disc.mark;
+            *slot = self
+                .pixel(view, mark, left_from_gripper, &eye_in_gripper)
+                .filter(|_| !self.is_hidden(disc, left_from_gripper, &eye, &eye_in_gripper, &eye_in_boxes));
             if slot.is_some() {
                 let area = std::f64::consts::PI * mark.radius * mark.radius;
                 out.solid_angle += solid_angle(&mark.position, &mark.normal, area, &eye_in_gripper);
@@ -87,33 +113,34 @@ impl<'a> Scene<'a> {
         out
     }
 
-    fn mark(&self, view: View, mark: &Mark, pose: &Pose, eye: &Vec3, eye_in_gripper: &Vec3) -> Option<Pixel> {
+    /// Pixel of a mark that faces the camera and lies in the picture.
+    fn pixel(&self, view: View, mark: &Mark, pose: &Pose, eye_in_gripper: &Vec3) -> Option<Pixel> {
         let v = (eye_in_gripper - mark.position).try_normalize(1e-9)?;
         if v.dot(&mark.normal) < MIN_COSINE {
             return None;
         }
         let camera = self.rig.camera(view);
         let x = (pose * Point3::from(mark.position)).coords;
-        let pixel = self.rig.project(view, &x)?;
-        if !camera.contains(pixel, BORDER_PX) {
-            return None;
-        }
-        // Centre and four points of its edge: a disc that is half hidden has its centre in the wrong place.
-        let side = if mark.normal.x.abs() < 0.9 { Vec3::x() } else { Vec3::y() };
-        let e1 = mark.normal.cross(&side).normalize() * mark.radius;
-        let e2 = mark.normal.cross(&e1);
-        for d in [Vec3::zeros(), e1, -e1, e2, -e2] {
-            let p = mark.position + d;
+        self.rig.project(view, &x).filter(|pixel| camera.contains(*pixel, BORDER_PX))
+    }
+
+    /// Whether a box or the object stands before any of a mark's places.
+    fn is_hidden(
+        &self,
+        disc: &FlatDisc<'_>,
+        pose: &Pose,
+        eye: &Vec3,
+        eye_in_gripper: &Vec3,
+        eye_in_boxes: &[Vec3],
+    ) -> bool {
+        disc.places.iter().enumerate().any(|(k, p)| {
             let length = (eye_in_gripper - p).norm();
-            if self.boxes.iter().filter_map(|b| b.cut(&p, eye_in_gripper)).any(|(t0, t1)| (t1 - t0) * length > GRAZE_M)
-            {
-                return None;
-            }
-            if self.obstacle.is_some_and(|o| o.blocks(&(pose * Point3::from(p)).coords, eye)) {
-                return None;
-            }
-        }
-        Some(pixel)
+            let boxes = self.boxes.iter().zip(&disc.in_boxes).zip(eye_in_boxes);
+            let mut cuts =
+                boxes.filter_map(|(((_, half), places), eye)| OrientedBox::cut_own(half, places.get(k)?, eye));
+            cuts.any(|(t0, t1)| (t1 - t0) * length > GRAZE_M)
+                || self.obstacle.is_some_and(|o| o.blocks(&(pose * Point3::from(*p)).coords, eye))
+        })
     }
 
     /// Both views' sights.

@@ -47,64 +47,102 @@ impl Votes {
     }
 }
 
-/// A picture at half its size: quick to search, and blind to the noise.
+/// Side of a patch.
+const SIDE: usize = 2 * HALF as usize + 1;
+/// Columns of a patch that are worked on: the rest of the wanted patch's rows is zero, so that what lies beside the other one does not count.
+const LANES: usize = 16;
+
+/// A picture at half its size: quick to search, and blind to the noise. Its values are sums of four grey values, so that all sums are exact.
 struct Small {
     w: usize,
     h: usize,
-    grey: Vec<f32>,
+    /// Values from one row to the next: rows have room for the last patch's lanes.
+    stride: usize,
+    sums: Vec<i16>,
 }
 
 impl Small {
     fn of(p: &Picture) -> Self {
         let (w, h) = (p.width() / 2, p.height() / 2);
-        let mut grey = Vec::with_capacity(w * h);
+        let stride = w + LANES - SIDE;
+        let mut sums = Vec::with_capacity(stride * h);
         for y in 0..h {
             let (a, b) = (p.row(2 * y), p.row(2 * y + 1));
-            grey.extend(
-                a.chunks_exact(2)
-                    .zip(b.chunks_exact(2))
-                    .take(w)
-                    .map(|(a, b)| a.iter().chain(b).map(|v| f32::from(*v)).sum::<f32>() * 0.25),
-            );
+            let pairs = a.chunks_exact(2).zip(b.chunks_exact(2)).take(w);
+            sums.extend(pairs.map(|(a, b)| a.iter().chain(b).map(|v| i16::from(*v)).sum::<i16>()));
+            sums.resize(stride * (y + 1), 0);
         }
-        Self { w, h, grey }
+        Self { w, h, stride, sums }
     }
 
-    /// The patch round a pixel, mean removed and of unit length; `None` at the border and where nothing is.
-    fn patch(&self, x: i32, y: i32, least: f32, out: &mut Vec<f32>) -> Option<()> {
-        let side = (2 * HALF + 1) as usize;
+    /// Where the patch round a pixel begins; `None` at the border.
+    fn first(&self, x: i32, y: i32) -> Option<usize> {
         let (x0, y0) = (usize::try_from(x - HALF).ok()?, usize::try_from(y - HALF).ok()?);
-        if x0 + side > self.w || y0 + side > self.h {
-            return None;
+        (x0 + SIDE <= self.w && y0 + SIDE <= self.h).then_some(y0 * self.stride + x0)
+    }
+
+    /// The rows of a patch, `LANES` wide.
+    fn rows(&self, first: usize) -> impl Iterator<Item = &[i16; LANES]> {
+        (0..SIDE).filter_map(move |k| self.sums.get(first + k * self.stride..)?.first_chunk())
+    }
+
+    /// The patch round a pixel; `None` at the border and where nothing is.
+    fn patch(&self, x: i32, y: i32, least: f32) -> Option<Patch> {
+        let mut rows = [[0i16; LANES]; SIDE];
+        for (row, source) in rows.iter_mut().zip(self.rows(self.first(x, y)?)) {
+            row.iter_mut().zip(source).take(SIDE).for_each(|(v, s)| *v = *s);
         }
-        out.clear();
-        for row in 0..side {
-            let o = (y0 + row) * self.w + x0;
-            out.extend_from_slice(self.grey.get(o..o + side)?);
+        let sum = rows.iter().flatten().map(|v| i32::from(*v)).sum();
+        let square = rows.iter().flatten().map(|v| i32::from(*v) * i32::from(*v)).sum();
+        let size = size(sum, square, least)?;
+        Some(Patch { rows, sum, size })
+    }
+
+    /// Correlation of a patch with that round a pixel; `None` at the border and where nothing is.
+    fn correlation(&self, wanted: &Patch, totals: &Totals, x: i32, y: i32, least: f32) -> Option<f32> {
+        let first = self.first(x, y)?;
+        let (sum, square) = totals.of(first)?;
+        let size = size(sum, square, least)?;
+        let mut products = [0i32; LANES / 2];
+        for (row, source) in wanted.rows.iter().zip(self.rows(first)) {
+            for ((p, a), b) in products.iter_mut().zip(row.as_chunks::<2>().0).zip(source.as_chunks::<2>().0) {
+                *p += i32::from(a[0]) * i32::from(b[0]) + i32::from(a[1]) * i32::from(b[1]);
+            }
         }
-        let n = out.len() as f32;
-        let mean = out.iter().sum::<f32>() / n;
-        out.iter_mut().for_each(|v| *v -= mean);
-        let size = out.iter().map(|v| v * v).sum::<f32>().sqrt();
-        if size < least * n.sqrt() {
-            return None;
+        let product: i32 = products.iter().sum();
+        let joint = f64::from(product) - f64::from(wanted.sum) * f64::from(sum) / COUNT;
+        Some((joint / (wanted.size * size)) as f32)
+    }
+
+    /// Products of the gradient (`xx`, `xy`, `yy`) over the column of each pixel of a row: every other of nine rows. Nothing at the border.
+    fn columns(&self, y: usize, out: &mut [Vec<f32>; 3]) {
+        let [xx, xy, yy] = out;
+        for o in [&mut *xx, &mut *xy, &mut *yy] {
+            o.clear();
+            o.resize(self.w, 0.0);
         }
-        out.iter_mut().for_each(|v| *v /= size);
-        Some(())
+        let row = |y: usize| self.sums.get(y * self.stride..y * self.stride + self.w).unwrap_or(&[]);
+        for v in (y.saturating_sub(4)..=y + 4).step_by(2) {
+            let (above, here, below) = (row(v.saturating_sub(1)), row(v), row(v + 1));
+            let sides = here.iter().zip(here.iter().skip(2));
+            let ends = above.iter().skip(1).zip(below.iter().skip(1));
+            let sums = xx.iter_mut().skip(1).zip(xy.iter_mut().skip(1)).zip(yy.iter_mut().skip(1));
+            for ((((xx, xy), yy), (l, r)), (a, b)) in sums.zip(sides).zip(ends) {
+                let (dx, dy) = (f32::from(r - l), f32::from(b - a));
+                *xx += dx * dx;
+                *xy += dx * dy;
+                *yy += dy * dy;
+            }
+        }
     }
 
     /// Smaller eigenvalue of the structure tensor: large where a patch has detail in both directions.
-    fn detail(&self, x: usize, y: usize) -> f32 {
-        let g = |x: usize, y: usize| self.grey.get(y * self.w + x).copied().unwrap_or(0.0);
-        let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
-        for v in (y - 4..=y + 4).step_by(2) {
-            for u in (x - 4..=x + 4).step_by(2) {
-                let (dx, dy) = (g(u + 1, v) - g(u - 1, v), g(u, v + 1) - g(u, v - 1));
-                xx += dx * dx;
-                xy += dx * dy;
-                yy += dy * dy;
-            }
-        }
+    fn detail(columns: &[Vec<f32>; 3], x: usize) -> f32 {
+        let [xx, xy, yy] = columns.each_ref().map(|c| {
+            c.get(x.saturating_sub(4)..)
+                .and_then(|c| c.first_chunk::<9>())
+                .map_or(0.0, |c| c[0] + c[2] + c[4] + c[6] + c[8])
+        });
         0.5 * (xx + yy - ((xx - yy) * (xx - yy) + 4.0 * xy * xy).sqrt())
     }
 
@@ -113,20 +151,78 @@ impl Small {
         let margin = HALF as usize + 6;
         let (cw, ch) = ((self.w.saturating_sub(2 * margin)) / CELLS[0], (self.h.saturating_sub(2 * margin)) / CELLS[1]);
         let mut out = Vec::new();
-        for cell in 0..CELLS[0] * CELLS[1] {
-            let (x0, y0) = (margin + (cell % CELLS[0]) * cw, margin + (cell / CELLS[0]) * ch);
-            let mut best = (0.0f32, None);
+        let mut columns = [const { Vec::new() }; 3];
+        for y0 in (0..CELLS[1]).map(|k| margin + k * ch) {
+            let mut best = [(0.0f32, None); CELLS[0]];
             for y in (y0..y0 + ch).step_by(3) {
-                for x in (x0..x0 + cw).step_by(3) {
-                    let d = self.detail(x, y);
-                    if d > best.0 {
-                        best = (d, Some((x, y)));
+                self.columns(y, &mut columns);
+                for (k, best) in best.iter_mut().enumerate() {
+                    let x0 = margin + k * cw;
+                    for x in (x0..x0 + cw).step_by(3) {
+                        let d = Self::detail(&columns, x);
+                        if d > best.0 {
+                            *best = (d, Some((x, y)));
+                        }
                     }
                 }
             }
-            out.extend(best.1);
+            out.extend(best.iter().filter_map(|b| b.1));
         }
         out
+    }
+}
+
+/// Number of values in a patch.
+const COUNT: f64 = (SIDE * SIDE) as f64;
+
+/// A patch that is looked for.
+struct Patch {
+    rows: [[i16; LANES]; SIDE],
+    sum: i32,
+    size: f64,
+}
+
+/// Root of the summed squares about the mean; `None` where it is less than `least` grey levels a pixel.
+fn size(sum: i32, square: i32, least: f32) -> Option<f64> {
+    let size = (f64::from(square) - f64::from(sum) * f64::from(sum) / COUNT).max(0.0).sqrt();
+    (size > 0.0 && size >= 4.0 * f64::from(least) * COUNT.sqrt()).then_some(size)
+}
+
+/// Sums and sums of squares over every patch of a picture.
+///
+/// The squares' running sums overflow; what wraps round drops out of the differences, and those of a patch fit.
+struct Totals {
+    stride: usize,
+    running: Vec<[u32; 2]>,
+}
+
+impl Totals {
+    fn of_picture(p: &Small) -> Self {
+        let stride = p.stride + 1;
+        let mut running = vec![[0u32; 2]; stride];
+        running.reserve(stride * p.h);
+        for (y, row) in p.sums.chunks_exact(p.stride).enumerate() {
+            let mut along = [0u32; 2];
+            running.push(along);
+            for (x, v) in row.iter().enumerate() {
+                let v = u32::from(v.unsigned_abs());
+                let above = running.get(y * stride + x + 1).copied().unwrap_or_default();
+                along = [along[0].wrapping_add(v), along[1].wrapping_add(v * v)];
+                running.push([above[0].wrapping_add(along[0]), above[1].wrapping_add(along[1])]);
+            }
+        }
+        Self { stride, running }
+    }
+
+    /// Sum and sum of squares of the patch that begins at a place of the picture.
+    fn of(&self, first: usize) -> Option<(i32, i32)> {
+        // The running sums have one column more than the picture.
+        let at = first + first / (self.stride - 1);
+        let corner = |k: usize| self.running.get(at + k);
+        let below = SIDE * self.stride;
+        let (a, b, c, d) = (corner(0)?, corner(SIDE)?, corner(below)?, corner(below + SIDE)?);
+        let sum = |i: usize| d[i].wrapping_sub(b[i]).wrapping_sub(c[i]).wrapping_add(a[i]) as i32;
+        Some((sum(0), sum(1)))
     }
 }
 
@@ -136,18 +232,15 @@ pub fn votes(pictures: [&Picture; 2], lenses: [&Lens; 2], p: [&Projection; 2], n
     let small = pictures.map(Small::of);
     let (Some(a), Some(b)) = (Ray::new(lenses, p, 0), Ray::new(lenses, p, 1)) else { return votes };
     let least = (1.5 * noise).max(1.0) as f32;
-    let (mut wanted, mut there) = (Vec::new(), Vec::new());
+    let totals = Totals::of_picture(&small[1]);
     for (x, y) in small[0].spots() {
-        if small[0].patch(x as i32, y as i32, least, &mut wanted).is_none() {
-            continue;
-        }
+        let Some(wanted) = small[0].patch(x as i32, y as i32, least) else { continue };
         let at = Pixel::new(2.0 * x as f64 + 0.5, 2.0 * y as f64 + 0.5);
         // The first picture is the left camera's as given, the right camera's if exchanged.
         let mut best = [-1.0f32; 2];
         for (ray, best) in [&a, &b].into_iter().zip(&mut best) {
             for (u, v) in ray.places(at) {
-                if small[1].patch(u, v, 0.5 * least, &mut there).is_some() {
-                    let c: f32 = wanted.iter().zip(&there).map(|(a, b)| a * b).sum();
+                if let Some(c) = small[1].correlation(&wanted, &totals, u, v, 0.5 * least) {
                     *best = best.max(c);
                 }
             }
