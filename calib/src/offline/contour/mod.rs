@@ -28,6 +28,8 @@ pub(in crate::offline) const INDEPENDENT_PX: f64 = 3.5;
 pub(in crate::offline) const FLOOR_PX: f64 = 0.03;
 /// Edges that scatter more about their ellipse belong to several contours. A round bar's outline, which is none, stays below half of it.
 const MOST_SCATTER_PX: f64 = 0.9;
+/// Contours that are remembered: a selection has a handful of candidates, and the next one has others.
+const MOST_KEPT: usize = 16;
 /// Smallest part of an ellipse that has to carry edges.
 pub(in crate::offline) const LEAST_COVERAGE: f64 = 0.25;
 
@@ -239,7 +241,11 @@ impl<'a> ViewEdges<'a> {
             return known.clone();
         }
         let sharp = self.sharpen(c);
-        self.sharp.borrow_mut().push((c.clone(), sharp.clone()));
+        let mut known = self.sharp.borrow_mut();
+        if known.len() >= MOST_KEPT {
+            known.remove(0);
+        }
+        known.push((c.clone(), sharp.clone()));
         sharp
     }
 

@@ -21,8 +21,6 @@ pub(in crate::offline) const SLOPES: usize = 2 * REACH as usize + 1;
 const STEPS: usize = 4;
 /// Shading of the surfaces beside an edge: change a pixel in parts of the edge's own step (standard deviation).
 const SHADING: f64 = 0.006;
-/// Weight that keeps the shading at nothing.
-const FIRM: f64 = 1e12;
 /// Places along the edge whose slopes are averaged, pixels.
 const ASIDE: [f64; 3] = [-1.0, 0.0, 1.0];
 /// Variance along the edge that the averaging adds.
@@ -64,10 +62,16 @@ struct Fit {
     count: usize,
     /// Slope of the shading on the dark and on the bright side of the first step, grey levels a pixel.
     shading: [f64; 2],
-    /// Weight of what is known about the shading beforehand.
-    prior: f64,
+    /// Weight of what is known about the shading beforehand; `None` while there is taken to be none.
+    prior: Option<f64>,
     left: [f64; SLOPES],
     variance: f64,
+}
+
+impl Fit {
+    fn is_shaded(&self) -> bool {
+        self.prior.is_some()
+    }
 }
 
 /// Finds the place of an edge among its neighbours. `blur` is the picture's [`lens_blur`]; `noise` is in grey levels.
@@ -88,7 +92,7 @@ pub fn sharpen(picture: &Picture, start: &Refined, noise: f64, blur: f64) -> Opt
         place: [0.0; STEPS],
         count: 1,
         shading: [0.0; 2],
-        prior: FIRM,
+        prior: None,
         left: slope,
         variance: 0.0,
     };
@@ -119,7 +123,7 @@ pub fn sharpen(picture: &Picture, start: &Refined, noise: f64, blur: f64) -> Opt
         }
     }
     // Shading explains part of any neighbour, so it is only let in when the neighbours are known.
-    fit.prior = (quiet / (SHADING * fit.strength[0])).powi(2);
+    fit.prior = Some((quiet / (SHADING * fit.strength[0])).powi(2));
     solve(&slope, width, &mut fit)?;
     let moved = fit.place[0];
     // Swapped with a neighbour, or dissolved into several: better no point than a wrong one.
@@ -172,79 +176,98 @@ pub(in crate::offline) fn tangential_width(blur: f64) -> f64 {
     (SCALE * SCALE + ASIDE_VARIANCE + blur * blur).sqrt()
 }
 
-/// Least squares on strengths and places; `None` when it fails. The variance is that of the first place for unit slope noise.
-fn solve(slope: &[f64], width: f64, fit: &mut Fit) -> Option<()> {
+/// What the steps contribute at a sample: the bell of each, and the part of the first one's bright side.
+#[derive(Clone, Copy)]
+struct Sample {
+    bells: [f64; STEPS],
+    bright: f64,
+}
+
+/// Least squares on strengths, places and shading; `None` when it fails. The variance is that of the first place for unit slope noise.
+fn solve(slope: &[f64; SLOPES], width: f64, fit: &mut Fit) -> Option<()> {
     const N: usize = 2 * STEPS + 2;
     const SHADE: usize = 2 * STEPS;
     let unit = width * (2.0 * std::f64::consts::PI).sqrt();
     let at = |i: usize| 0.5 * (i as f64 - f64::from(REACH));
-    let model = |fit: &Fit, t: f64| -> (f64, SVector<f64, N>) {
-        let mut d = SVector::<f64, N>::zeros();
-        let mut y = 0.0;
-        for k in 0..fit.count {
-            let z = (t - fit.place[k]) / width;
-            let g = (-0.5 * z * z).exp() / unit;
-            y += fit.strength[k] * g;
-            d[2 * k] = g;
-            d[2 * k + 1] = fit.strength[k] * g * z / width;
-        }
-        // The shading of either side ends at the first step, where both are blurred into each other.
-        let z = (t - fit.place[0]) / width;
-        let bright = 0.5 + 0.5 * (0.797_885 * z + 0.035_68 * z * z * z).tanh();
-        let g = (-0.5 * z * z).exp() / unit;
-        y += fit.shading[0] * (1.0 - bright) + fit.shading[1] * bright;
-        d[1] += (fit.shading[0] - fit.shading[1]) * g;
-        d[SHADE] = 1.0 - bright;
-        d[SHADE + 1] = bright;
-        (y, d)
-    };
-    let cost = |fit: &mut Fit| -> f64 {
+    // The samples are those of the last cost: the derivatives there are made of them.
+    let cost = |fit: &mut Fit, samples: &mut [Sample; SLOPES]| -> f64 {
         let mut sum = 0.0;
-        for (i, s) in slope.iter().enumerate() {
-            let r = s - model(fit, at(i)).0;
+        for (i, (s, sample)) in slope.iter().zip(samples).enumerate() {
+            let mut y = 0.0;
+            for k in 0..fit.count {
+                let z = (at(i) - fit.place[k]) / width;
+                sample.bells[k] = (-0.5 * z * z).exp() / unit;
+                y += fit.strength[k] * sample.bells[k];
+            }
+            if fit.is_shaded() {
+                // The shading of either side ends at the first step, where both are blurred into each other.
+                let z = (at(i) - fit.place[0]) / width;
+                sample.bright = 0.5 + 0.5 * (0.797_885 * z + 0.035_68 * z * z * z).tanh();
+                y += fit.shading[0] * (1.0 - sample.bright) + fit.shading[1] * sample.bright;
+            }
+            let r = s - y;
             fit.left[i] = r;
             sum += r * r;
         }
-        sum + fit.prior * fit.shading.iter().map(|s| s * s).sum::<f64>()
+        sum + fit.prior.unwrap_or(0.0) * fit.shading.iter().map(|s| s * s).sum::<f64>()
     };
-    // Normal matrix and gradient; unused steps stand still.
-    let normal = |fit: &Fit| -> (SMatrix<f64, N, N>, SVector<f64, N>) {
+    // Normal matrix and gradient; what is not in use stands still.
+    let normal = |fit: &Fit, samples: &[Sample; SLOPES]| -> (SMatrix<f64, N, N>, SVector<f64, N>) {
         let (mut a, mut g) = (SMatrix::<f64, N, N>::zeros(), SVector::<f64, N>::zeros());
-        for i in 0..slope.len() {
-            let d = model(fit, at(i)).1;
-            a += d * d.transpose();
-            g += d * fit.left[i];
+        let steps = 2 * fit.count;
+        let uses = |k: usize| k < steps || (k >= SHADE && fit.is_shaded());
+        for (i, (left, sample)) in fit.left.iter().zip(samples).enumerate() {
+            let mut d = [0.0; N];
+            for k in 0..fit.count {
+                let z = (at(i) - fit.place[k]) / width;
+                d[2 * k] = sample.bells[k];
+                d[2 * k + 1] = fit.strength[k] * sample.bells[k] * z / width;
+            }
+            if fit.is_shaded() {
+                d[1] += (fit.shading[0] - fit.shading[1]) * sample.bells[0];
+                d[SHADE] = 1.0 - sample.bright;
+                d[SHADE + 1] = sample.bright;
+            }
+            for (p, dp) in d.iter().enumerate().filter(|(p, _)| uses(*p)) {
+                g[p] += dp * left;
+                for (q, dq) in d.iter().enumerate().filter(|(q, _)| uses(*q)) {
+                    a[(q, p)] += dq * dp;
+                }
+            }
         }
         let size = a.diagonal().max();
         for k in 0..N {
-            a[(k, k)] = if k < 2 * fit.count || k >= SHADE { a[(k, k)] + 1e-12 * size } else { 1.0 };
+            a[(k, k)] = if uses(k) { a[(k, k)] + 1e-12 * size } else { 1.0 };
         }
-        for k in 0..2 {
-            a[(SHADE + k, SHADE + k)] += fit.prior;
-            g[SHADE + k] -= fit.prior * fit.shading[k];
+        if let Some(prior) = fit.prior {
+            for k in 0..2 {
+                a[(SHADE + k, SHADE + k)] += prior;
+                g[SHADE + k] -= prior * fit.shading[k];
+            }
         }
         (a, g)
     };
-    let mut now = cost(fit);
+    let mut samples = [Sample { bells: [0.0; STEPS], bright: 0.0 }; SLOPES];
+    let mut now = cost(fit, &mut samples);
     let mut damp = 1e-4;
     for _ in 0..25 {
-        let (mut a, g) = normal(fit);
+        let (mut a, g) = normal(fit, &samples);
         for k in 0..N {
             a[(k, k)] *= 1.0 + damp;
         }
         let step = a.cholesky()?.solve(&g);
-        let (strength, place, left, shading) = (fit.strength, fit.place, fit.left, fit.shading);
-        for k in 0..2 {
-            fit.shading[k] += step[SHADE + k];
-        }
+        let before = (fit.strength, fit.place, fit.left, fit.shading, samples);
         for k in 0..fit.count {
             fit.strength[k] += step[2 * k];
             fit.place[k] += step[2 * k + 1].clamp(-0.7, 0.7);
         }
+        for k in 0..2 {
+            fit.shading[k] += step[SHADE + k];
+        }
         if fit.place.iter().take(fit.count).any(|p| p.abs() > 0.5 * f64::from(REACH) + 1.0) {
             return None;
         }
-        let next = cost(fit);
+        let next = cost(fit, &mut samples);
         if next <= now {
             let small = (now - next) <= 1e-9 * now;
             now = next;
@@ -253,14 +276,14 @@ fn solve(slope: &[f64], width: f64, fit: &mut Fit) -> Option<()> {
                 break;
             }
         } else {
-            (fit.strength, fit.place, fit.left, fit.shading) = (strength, place, left, shading);
+            (fit.strength, fit.place, fit.left, fit.shading, samples) = before;
             damp *= 10.0;
             if damp > 1e4 {
                 break;
             }
         }
     }
-    fit.variance = normal(fit).0.cholesky()?.inverse()[(1, 1)];
+    fit.variance = normal(fit, &samples).0.cholesky()?.inverse()[(1, 1)];
     Some(())
 }
 
