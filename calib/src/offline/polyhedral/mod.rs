@@ -7,13 +7,17 @@ pub mod bvh;
 pub mod faces;
 pub mod filter;
 pub mod handles;
+mod links;
 mod mesh;
 mod obj;
 pub mod overlay;
+mod place;
 pub mod plan;
 pub mod pose;
+mod raster;
 pub mod reach;
 pub mod read;
+mod smooth;
 mod stl;
 pub mod topology;
 

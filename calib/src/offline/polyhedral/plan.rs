@@ -159,7 +159,7 @@ pub fn survey<'a>(
     options: &MeshOptions,
 ) -> Survey<'a> {
     let tree = Bvh::new(mesh);
-    let faces = faces(mesh, &options.flat);
+    let faces = faces(mesh, &tree, &options.flat);
     let found = enumerate(mesh, &faces, &options.opposition);
     let situation = Situation {
         rig: Some(&rig.rig),
