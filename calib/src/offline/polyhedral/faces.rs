@@ -3,7 +3,7 @@
 use super::bvh::Bvh;
 use super::links::Links;
 use super::mesh::Mesh;
-use super::smooth::{noise, smoothed};
+use super::smooth::{crumpled, noise, relaxed, smoothed};
 use graspd_rt::geom::Vec3;
 use std::collections::VecDeque;
 
@@ -103,7 +103,7 @@ pub fn faces(mesh: &Mesh, tree: &Bvh<'_>, flat: &Flatness) -> Vec<Face> {
     let mut found: Vec<Face> = regions.into_iter().filter_map(|r| g.face(r)).collect();
     found = g.merge(found, &mut owner);
     if g.crumpled {
-        g.absorb(&mut found, &mut owner);
+        found = g.complete(mesh, found);
     }
     found.sort_by(|a, b| b.area.total_cmp(&a.area));
     found
@@ -121,18 +121,27 @@ impl Ground {
     fn new(mesh: &Mesh, tree: &Bvh<'_>, flat: &Flatness) -> Self {
         let n = mesh.triangles.len();
         let links = Links::new(mesh, tree);
-        let (mut vector, mut centre, mut needle) = (Vec::with_capacity(n), Vec::with_capacity(n), Vec::with_capacity(n));
         let thin = 1e-5 * mesh.size().norm();
-        for t in 0..n {
-            let [a, b, c] = mesh.corners(t);
-            let x = (b - a).cross(&(c - a)) * 0.5;
-            let longest = (b - a).norm().max((c - b).norm()).max((a - c).norm());
-            vector.push(x);
-            centre.push((a + b + c) / 3.0);
-            needle.push(2.0 * x.norm() < thin * longest);
+        let measure = |mesh: &Mesh| {
+            let (mut vector, mut centre, mut needle) = (Vec::with_capacity(n), Vec::with_capacity(n), Vec::with_capacity(n));
+            for t in 0..n {
+                let [a, b, c] = mesh.corners(t);
+                let x = (b - a).cross(&(c - a)) * 0.5;
+                let longest = (b - a).norm().max((c - b).norm()).max((a - c).norm());
+                vector.push(x);
+                centre.push((a + b + c) / 3.0);
+                needle.push(2.0 * x.norm() < thin * longest);
+            }
+            (vector, centre, needle)
+        };
+        let noise = noise(mesh);
+        let (mut vector, mut centre, needle) = measure(mesh);
+        let crumpled = crumpled(&links, &vector, &needle);
+        if crumpled {
+            (vector, centre, _) = measure(&relaxed(mesh, noise));
         }
-        let (normal, crumpled) = smoothed(&links, &vector, &needle);
-        let distance = flat.distance.max((3.5 * noise(mesh)).min(MOST_DISTANCE));
+        let normal = smoothed(&links, &vector, &needle, crumpled);
+        let distance = flat.distance.max((3.5 * noise).min(MOST_DISTANCE));
         Self { links, normal, vector, centre, needle, crumpled, distance, cos: flat.angle.cos() }
     }
 
@@ -247,29 +256,47 @@ impl Ground {
         groups.into_iter().filter(|g| !g.is_empty()).filter_map(|g| self.face(g)).collect()
     }
 
-    /// Gives to a scan's faces the crumpled triangles within them, each held by two of the face at least.
-    fn absorb(&self, found: &mut [Face], owner: &mut [u32]) {
-        for (k, f) in found.iter_mut().enumerate() {
-            own(owner, &f.triangles, k as u32 + 1);
-        }
-        for f in found.iter_mut() {
-            let mine = f.triangles.first().map_or(0, |t| get(owner, *t));
+    /// Gives to a scan's faces every triangle that lies in their plane and holds together with them, however it is turned: near an edge and in a
+    /// crumple the normals say little. A triangle may so belong to two faces that meet. Faces that come out again are left out.
+    fn complete(&self, mesh: &Mesh, mut found: Vec<Face>) -> Vec<Face> {
+        found.sort_by(|a, b| b.area.total_cmp(&a.area));
+        let n = mesh.triangles.len();
+        // The last face that reached each triangle, counted from 1, and the one of them that holds it for its own.
+        let (mut reached, mut held) = (vec![0u32; n], vec![0u32; n]);
+        let mut out: Vec<Face> = Vec::new();
+        for f in found {
+            let again = f.triangles.iter().filter(|t| {
+                let by = (get(&held, **t) as usize).checked_sub(1).and_then(|k| out.get(k));
+                by.is_some_and(|o: &Face| o.normal.dot(&f.normal) > self.cos)
+            });
+            if 2 * again.count() > f.triangles.len() {
+                continue;
+            }
+            // The plane by the scan itself, not by its relaxed shape.
+            let mark = out.len() as u32 + 1;
+            let corners = |t: u32| mesh.corners(t as usize);
+            let count = (3 * f.triangles.len().max(1)) as f64;
+            let centre = f.triangles.iter().flat_map(|t| corners(*t)).sum::<Vec3>() / count;
+            let flat = |t: u32| corners(t).iter().all(|p| (p - centre).dot(&f.normal).abs() <= self.distance);
+            let mut queue = f.triangles.clone();
+            own(&mut reached, &queue, mark);
+            own(&mut held, &queue, mark);
             let mut next = 0;
-            while let Some(t) = f.triangles.get(next).copied() {
+            while let Some(t) = queue.get(next).copied() {
                 next += 1;
                 for k in self.links.of(t) {
-                    let flat = ((get(&self.centre, *k) - f.centre).dot(&f.normal)).abs() <= self.distance;
-                    let same = get(&self.needle, *k) || get(&self.normal, *k).dot(&f.normal) >= SAME_SIDE;
-                    let held = || self.links.of(*k).iter().filter(|t| get(owner, **t) == mine).count() > 1;
-                    if get(owner, *k) == 0 && flat && same && held() {
-                        own(owner, &[*k], mine);
-                        f.triangles.push(*k);
+                    if get(&reached, *k) != mark && flat(*k) {
+                        own(&mut reached, &[*k], mark);
+                        if get(&self.normal, *k).dot(&f.normal) > SAME_SIDE {
+                            own(&mut held, &[*k], mark);
+                        }
+                        queue.push(*k);
                     }
                 }
             }
-            if let Some(whole) = self.face(std::mem::take(&mut f.triangles)) {
-                *f = whole;
-            }
+            let area = queue.iter().map(|t| get(&self.vector, *t).dot(&f.normal).max(0.0)).sum();
+            out.push(Face { normal: f.normal, centre, area, triangles: queue });
         }
+        out
     }
 }

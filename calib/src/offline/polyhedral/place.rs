@@ -143,15 +143,25 @@ impl<'a> Setting<'a> {
         let n = cells.len().max(1) as f64;
         let middle = cells.iter().map(|c| c.side).sum::<f64>() / n;
         let range = cells.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), c| (a.min(c.side), b.max(c.side)));
-        // Half a claw apart, so that no room as wide as a claw and a half is stepped over.
-        let steps = ((range.1 - range.0) / (0.5 * self.claw.half_width).max(o.cell)).ceil().clamp(8.0, 80.0);
-        let mut sides = vec![middle];
-        sides.extend((0..=steps as usize).map(|k| range.0 + (range.1 - range.0) * k as f64 / steps));
-        sides.sort_by(|a, b| (a - middle).abs().total_cmp(&(b - middle).abs()));
+        // Half of half a claw's width apart first; where nothing is free there, between those, so that hardly any room is stepped over.
+        let steps = (2.0 * (range.1 - range.0) / self.claw.half_width.max(o.cell)).ceil().clamp(8.0, 80.0);
+        let at = |k: f64| range.0 + (range.1 - range.0) * k / steps;
+        let nearest_first = |mut sides: Vec<f64>| {
+            sides.sort_by(|a, b| (a - middle).abs().total_cmp(&(b - middle).abs()));
+            sides
+        };
+        let coarse = nearest_first((0..=steps as usize).map(|k| at(k as f64)).chain([middle]).collect());
+        let fine = nearest_first(
+            (0..steps as usize).flat_map(|k| [0.25, 0.5, 0.75].map(|f| at(k as f64 + f))).collect(),
+        );
         let mut failed: Option<(Reason, f64, Pose)> = None;
         let mut most = 0.0f64;
         let mut any = false;
-        for side in sides {
+        let count = coarse.len();
+        for (k, side) in coarse.into_iter().chain(fine).enumerate() {
+            if any && k >= count {
+                break;
+            }
             let mut strip: Vec<Cell> =
                 cells.iter().filter(|c| (c.side - side).abs() <= self.claw.half_width.max(0.5 * o.cell)).copied().collect();
             strip.sort_by(|a, b| a.depth.total_cmp(&b.depth));
