@@ -139,6 +139,14 @@ impl<'a> Bvh<'a> {
         RAYS.iter().take(3).filter(|d| odd(d)).count() > 1
     }
 
+    /// Every triangle that a ray meets.
+    pub fn pierced(&self, p: &Vec3, direction: &Vec3) -> Vec<u32> {
+        let mut out = Vec::new();
+        self.ray(p, direction, |t, _, _| out.push(t));
+        out.sort_unstable();
+        out
+    }
+
     /// Whether the first triangle that a ray meets is met from its inner side; `None` when there is none.
     fn first_hit(&self, p: &Vec3, direction: &Vec3) -> Option<bool> {
         let mut first: Option<(f64, bool)> = None;

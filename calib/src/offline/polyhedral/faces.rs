@@ -33,7 +33,7 @@ pub struct Face {
     pub centre: Vec3,
     /// Area, square metres.
     pub area: f64,
-    /// Its triangles.
+    /// Its triangles, ascending.
     pub triangles: Vec<u32>,
 }
 
@@ -41,6 +41,8 @@ pub struct Face {
 const SAME_PLANE: f64 = 0.9986;
 /// A triangle beside a face belongs to it when it lies in its plane and faces its side: cosine of 50 degrees, for the crumples of a scan.
 const SAME_SIDE: f64 = 0.643;
+/// The angle within which two faces are partners: 4 degrees, less than what makes them a handle.
+const PARTNER: f64 = 0.9976;
 /// A region may not reach further from its plane than this, however noisy, metres.
 const MOST_DISTANCE: f64 = 1e-3;
 
@@ -106,6 +108,8 @@ pub fn faces(mesh: &Mesh, tree: &Bvh<'_>, flat: &Flatness) -> Vec<Face> {
         found = g.complete(mesh, found);
     }
     found.sort_by(|a, b| b.area.total_cmp(&a.area));
+    let partners = g.partners(tree, &found, flat);
+    found.extend(partners);
     found
 }
 
@@ -160,7 +164,12 @@ impl Ground {
     }
 
     fn grow(&self, seed: u32, owner: &[u32], stamp: &mut [u32], mark: u32) -> Vec<u32> {
-        let (mut plane_n, mut plane_c) = (get(&self.normal, seed), get(&self.centre, seed));
+        self.spread(seed, owner, stamp, mark, None)
+    }
+
+    /// The region round a seed, in the plane of a given normal or, without one, in the plane that it turns out to have.
+    fn spread(&self, seed: u32, owner: &[u32], stamp: &mut [u32], mark: u32, fixed: Option<Vec3>) -> Vec<u32> {
+        let (mut plane_n, mut plane_c) = (fixed.unwrap_or(get(&self.normal, seed)), get(&self.centre, seed));
         let (mut sum_n, mut sum_c, mut sum_a) = (Vec3::zeros(), Vec3::zeros(), 0.0);
         let mut queue = VecDeque::from([seed]);
         let mut out = Vec::new();
@@ -174,7 +183,7 @@ impl Ground {
             sum_c += get(&self.centre, t) * a;
             sum_a += a;
             // The plane follows the region while it is young, then stands: a slowly turning surface must not lead it round.
-            if out.len().is_power_of_two() && out.len() <= 4096 {
+            if fixed.is_none() && out.len().is_power_of_two() && out.len() <= 4096 {
                 if let Some(n) = sum_n.try_normalize(1e-300) {
                     plane_n = n;
                     plane_c = sum_c / sum_a;
@@ -200,7 +209,8 @@ impl Ground {
     }
 
     /// The face that triangles make up. The sum of their area vectors depends only on their common outline, so that a scan's noise cancels.
-    fn face(&self, triangles: Vec<u32>) -> Option<Face> {
+    fn face(&self, mut triangles: Vec<u32>) -> Option<Face> {
+        triangles.sort_unstable();
         let (mut sum_n, mut sum_c, mut sum_a) = (Vec3::zeros(), Vec3::zeros(), 0.0);
         for t in &triangles {
             let v = get(&self.vector, *t);
@@ -256,6 +266,34 @@ impl Ground {
         groups.into_iter().filter(|g| !g.is_empty()).filter_map(|g| self.face(g)).collect()
     }
 
+    /// Round walls are cut into strips where growing happened to begin, on one side not where on the other. For each strip whose opposite is not
+    /// its partner already, the strip that is.
+    fn partners(&self, tree: &Bvh<'_>, found: &[Face], flat: &Flatness) -> Vec<Face> {
+        let mut out: Vec<Face> = Vec::new();
+        let mut stamp = vec![0u32; self.normal.len()];
+        let none = stamp.clone();
+        let mut mark = 0;
+        let opposed = |f: &Face, n: &Vec3| f.normal.dot(n) <= -PARTNER;
+        for f in found {
+            // The triangle nearest to the middle: the middle itself may be in the air.
+            let off = |t: &u32| (get(&self.centre, *t) - f.centre).norm_squared();
+            let Some(middle) = f.triangles.iter().min_by(|a, b| off(a).total_cmp(&off(b))) else { continue };
+            let hits = tree.pierced(&get(&self.centre, *middle), &-f.normal);
+            for hit in hits.into_iter().filter(|t| t != middle && get(&self.normal, *t).dot(&f.normal) <= -self.cos) {
+                let near = |g: &Face| (get(&self.centre, hit) - g.centre).dot(&g.normal).abs() <= self.distance;
+                if found.iter().chain(&out).any(|g| opposed(f, &g.normal) && near(g) && g.triangles.binary_search(&hit).is_ok()) {
+                    continue;
+                }
+                mark += 1;
+                let grown = self.spread(hit, &none, &mut stamp, mark, Some(-f.normal));
+                if let Some(g) = self.face(grown).filter(|g| g.area >= flat.area && opposed(f, &g.normal)) {
+                    out.push(g);
+                }
+            }
+        }
+        out
+    }
+
     /// Gives to a scan's faces every triangle that lies in their plane and holds together with them, however it is turned: near an edge and in a
     /// crumple the normals say little. A triangle may so belong to two faces that meet. Faces that come out again are left out.
     fn complete(&self, mesh: &Mesh, mut found: Vec<Face>) -> Vec<Face> {
@@ -294,6 +332,7 @@ impl Ground {
                     }
                 }
             }
+            queue.sort_unstable();
             let area = queue.iter().map(|t| get(&self.vector, *t).dot(&f.normal).max(0.0)).sum();
             out.push(Face { normal: f.normal, centre, area, triangles: queue });
         }

@@ -129,6 +129,9 @@ fn overlaps(mesh: &Mesh, faces: [&Face; 2], closing: &Vec3, edges: &[Vec3], leas
     let Some(grid) = Grid::over(mesh, faces, origin, [u, v, *closing]) else { return Vec::new() };
     let (top, bottom) = (grid.heights(mesh, faces[0], 1.0), grid.heights(mesh, faces[1], -1.0));
     let both: Vec<bool> = top.iter().zip(&bottom).map(|(a, b)| !a.is_nan() && !b.is_nan()).collect();
+    // A scan's faces are ragged by about a triangle; a rim of few long edges is exact.
+    let edge = edges.iter().map(|e| e.norm()).sum::<f64>() / edges.len().max(1) as f64;
+    let ragged = if edge < 3.0 * grid.cell { 1.5 * edge } else { 0.0 };
     let mut out = Vec::new();
     for part in grid.parts(&both) {
         let cell = grid.cell;
@@ -144,7 +147,7 @@ fn overlaps(mesh: &Mesh, faces: [&Face; 2], closing: &Vec3, edges: &[Vec3], leas
             cells: part.iter().map(|k| grid.at(*k)).collect(),
             heights: part.iter().map(|k| [get(&top, *k), get(&bottom, *k)]).collect(),
         };
-        let ways = ways_in(&overlap, &grid.sides(&part), &flat);
+        let ways = ways_in(&overlap, &grid.sides(&part, ragged), &flat);
         out.push((overlap, ways));
     }
     out
@@ -173,8 +176,8 @@ fn main_direction(edges: &[[f64; 2]]) -> f64 {
     centre + if length > 0.0 { sum / length } else { 0.0 }
 }
 
-/// Sides that differ by less are one way in: 12 degrees.
-const SAME_WAY: f64 = 0.21;
+/// Sides that differ by less are one way in: 20 degrees.
+const SAME_WAY: f64 = 0.35;
 /// A side is a way in when it is this long, metres, and this part of the overlap's width there (a chamfer is not), ...
 const SIDE: (f64, f64) = (4e-3, 0.08);
 /// ... or when it is this part of the width: the end of a thin plate.

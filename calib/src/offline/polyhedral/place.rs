@@ -12,6 +12,8 @@ use std::f64::consts::PI;
 const PALM: f64 = 1e-3;
 /// Claws that close to this much more than the faces' distance (on each side) must not have met anything else, metres.
 const SLACK: f64 = 0.5e-3;
+/// Widths that differ by less are equal, metres: a part is 27 mm wide only as single precision goes.
+const EQUAL: f64 = 1e-6;
 /// Halvings of the range of depths: to a sixtieth of it.
 const HALVINGS: usize = 6;
 
@@ -133,10 +135,10 @@ impl<'a> Setting<'a> {
         });
         let air = 2.0 * self.s.clearance;
         let too_wide = |w: f64| Reason::TooWide { width_mm: (w + air) * 1e3, max_mm: max * 1e3 };
-        if narrow + air > max {
+        if narrow + air > max + EQUAL {
             return Err((too_wide(self.handle.width), 0.0, self.middle()));
         }
-        if wide < min {
+        if wide < min - EQUAL {
             let reason = Reason::TooThin { width_mm: self.handle.width * 1e3, min_mm: min * 1e3 };
             return Err((reason, 0.0, self.middle()));
         }
@@ -244,18 +246,18 @@ impl<'a> Setting<'a> {
         let origin = if turned { side + self.claw.middle } else { side - self.claw.middle };
         let pose = self.pose(origin, tip - self.claw.tip, 0.5 * (top + bottom), turned);
         let width = top - bottom;
-        let opening = width + 2.0 * self.s.clearance;
         let [min, max] = self.gripper.opening;
+        let opening = width + 2.0 * self.s.clearance;
         let fail = |reason: Reason| Err((reason, contact, pose));
-        if !(opening <= max) {
+        if !(opening <= max + EQUAL) {
             return fail(Reason::TooWide { width_mm: opening * 1e3, max_mm: max * 1e3 });
         }
-        if width < min {
+        if width < min - EQUAL {
             return fail(Reason::TooThin { width_mm: width * 1e3, min_mm: min * 1e3 });
         }
         match collision(self.tree, self.gripper, [opening, width], &pose, self.s) {
             Some(what) => fail(Reason::Collides { what }),
-            None => Ok(Place { pose, opening, contact }),
+            None => Ok(Place { pose, opening: opening.min(max), contact }),
         }
     }
 }

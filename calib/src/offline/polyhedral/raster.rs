@@ -148,8 +148,10 @@ impl Grid {
         out
     }
 
-    /// The sides of a part's outer outline: its two ends, metres along the axes, with the inside to the left.
-    pub(super) fn sides(&self, part: &[usize]) -> Vec<[[f64; 2]; 2]> {
+    /// The sides of a part's outer outline: its two ends, metres along the axes, with the inside to the left. What deviates from a straight side by
+    /// less than `ragged` (metres) is no corner.
+    pub(super) fn sides(&self, part: &[usize], ragged: f64) -> Vec<[[f64; 2]; 2]> {
+        let stair = STAIR.max(ragged / self.cell);
         let outline = self.outline(part);
         let n = outline.len();
         // The two corners farthest from each other lie on the simplified outline in any case.
@@ -170,7 +172,7 @@ impl Grid {
             let (dx, dy) = (q[0] - p[0], q[1] - p[1]);
             let length = dx.hypot(dy).max(1e-12);
             let off = |k: usize| ((at(k)[0] - p[0]) * dy - (at(k)[1] - p[1]) * dx).abs() / length;
-            if let Some(k) = (from + 1..to).max_by(|i, j| off(*i).total_cmp(&off(*j))).filter(|k| off(*k) > STAIR) {
+            if let Some(k) = (from + 1..to).max_by(|i, j| off(*i).total_cmp(&off(*j))).filter(|k| off(*k) > stair) {
                 kept.push(k % n);
                 todo.extend([(from, k), (k, to)]);
             }
@@ -276,14 +278,14 @@ mod tests {
             (0..6400).filter(|k| inside(grid.at(*k)[0], grid.at(*k)[1])).collect()
         };
         // A rectangle, a bar three cells wide, an L (with its hollow corner), a square turned by 30 degrees.
-        assert_eq!(grid.sides(&part(&|x, y| x > 5.0 && x < 60.0 && y > 7.0 && y < 30.0)).len(), 4);
-        assert_eq!(grid.sides(&part(&|x, y| x > 5.0 && x < 60.0 && y > 7.0 && y < 10.0)).len(), 4);
-        assert_eq!(grid.sides(&part(&|x, y| x < 20.0 || y < 20.0)).len(), 6);
+        assert_eq!(grid.sides(&part(&|x, y| x > 5.0 && x < 60.0 && y > 7.0 && y < 30.0), 0.0).len(), 4);
+        assert_eq!(grid.sides(&part(&|x, y| x > 5.0 && x < 60.0 && y > 7.0 && y < 10.0), 0.0).len(), 4);
+        assert_eq!(grid.sides(&part(&|x, y| x < 20.0 || y < 20.0), 0.0).len(), 6);
         let (s, c) = 30f64.to_radians().sin_cos();
         let turned = grid.sides(&part(&|x, y| {
             let (x, y) = (x - 40.0, y - 40.0);
             (x * c + y * s).abs() < 20.0 && (y * c - x * s).abs() < 20.0
-        }));
+        }), 0.0);
         assert_eq!(turned.len(), 4);
         for [p, q] in turned {
             let (dx, dy) = (q[0] - p[0], q[1] - p[1]);
