@@ -6,7 +6,7 @@ use crate::files::{
 };
 use crate::offline::edges::picture::Picture;
 use crate::offline::polyhedral::filter::Judged;
-use crate::offline::polyhedral::overlay;
+use crate::offline::polyhedral::{overlay, report};
 use crate::offline::polyhedral::plan::{MeshOptions, MeshPlan, MeshPlanError, Placed, Survey, survey};
 use crate::offline::polyhedral::pose::{Picked, fit};
 use crate::offline::polyhedral::reach::Arm;
@@ -67,6 +67,8 @@ pub struct MeshRequest {
     pub out: Option<PathBuf>,
     /// Where to write the picture.
     pub overlay: Option<PathBuf>,
+    /// Where to write the one-page report.
+    pub report: Option<PathBuf>,
 }
 
 type Failure = (Class, &'static str, String);
@@ -304,11 +306,19 @@ fn finish(
     if let Some(path) = &r.out {
         plan.file.save(path).map_err(file)?;
     }
-    if let Some(path) = &r.overlay {
-        let refuse = |reason: String| file(FileError::Write { path: path.display().to_string(), reason });
-        let drawn = overlay::draw(&plan, found, &m.mesh, placed, pictures.map(|[l, s]| [l, s]), rig, gripper)
-            .ok_or_else(|| refuse("the drawing is too large".to_owned()))?;
-        std::fs::write(path, drawn).map_err(|e| refuse(e.to_string()))?;
+    if r.overlay.is_some() || r.report.is_some() {
+        let drawn = overlay::draw(&plan, found, &m.mesh, placed, pictures.map(|[l, s]| [l, s]), rig, gripper);
+        let write = |path: &Path, bytes: Option<&[u8]>| {
+            let refuse = |reason: String| file(FileError::Write { path: path.display().to_string(), reason });
+            let bytes = bytes.ok_or_else(|| refuse("the drawing is too large".to_owned()))?;
+            std::fs::write(path, bytes).map_err(|e| refuse(e.to_string()))
+        };
+        if let Some(path) = &r.overlay {
+            write(path, drawn.as_deref())?;
+        }
+        if let Some(path) = &r.report {
+            write(path, Some(report::html(&plan, found, placed, rig, drawn.as_deref()).as_bytes()))?;
+        }
     }
     let (o, j) = (&plan.file.object, &plan.chosen);
     let mut text = summary(m, found);

@@ -17,6 +17,7 @@ pub mod pose;
 mod raster;
 pub mod reach;
 pub mod read;
+pub mod report;
 mod smooth;
 mod stl;
 pub mod topology;
