@@ -375,7 +375,9 @@ fn table(found: &Survey<'_>) -> String {
     let mut out =
         String::from("  N  width mm  closing (mesh)         approach (mesh)        contact mm2  marks  verdict\n");
     for (k, j) in found.handles.iter().enumerate() {
-        let v = |x: &Vec3| format!("({:>5.2}, {:>5.2}, {:>5.2})", x.x + 0.0, x.y + 0.0, x.z + 0.0);
+        // No minus before a nought that is only rounding error.
+        let n = |x: f64| if x.abs() < 0.005 { 0.0 } else { x };
+        let v = |x: &Vec3| format!("({:>5.2}, {:>5.2}, {:>5.2})", n(x.x), n(x.y), n(x.z));
         out += &format!(
             "{:>3}  {:>8.1}  {}  {}  {:>11.0}  {:>2} {:>2}  {}\n",
             k + 1,

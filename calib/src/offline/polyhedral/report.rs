@@ -37,7 +37,10 @@ pub fn html(plan: &MeshPlan, survey: &Survey<'_>, placed: &Placed, rig: &RigFile
 }
 
 fn vector(v: &Vec3, scale: f64, digits: usize) -> String {
-    v.iter().map(|x| format!("{:.digits$}", x * scale + 0.0)).collect::<Vec<_>>().join(", ")
+    // No minus before a nought that is only rounding error.
+    let least = 0.5 * 10f64.powi(-(digits as i32));
+    let number = |x: &f64| if (x * scale).abs() < least { 0.0 } else { x * scale };
+    v.iter().map(|x| format!("{:.digits$}", number(x))).collect::<Vec<_>>().join(", ")
 }
 
 fn part(h: &mut String, placed: &Placed) {
