@@ -6,11 +6,11 @@ use crate::files::{
 };
 use crate::offline::edges::picture::Picture;
 use crate::offline::polyhedral::filter::Judged;
-use crate::offline::polyhedral::{overlay, report};
 use crate::offline::polyhedral::plan::{MeshOptions, MeshPlan, MeshPlanError, Placed, Survey, survey};
 use crate::offline::polyhedral::pose::{Picked, fit};
 use crate::offline::polyhedral::reach::Arm;
 use crate::offline::polyhedral::read::{MeshFile, load, unit};
+use crate::offline::polyhedral::{overlay, report};
 use crate::plan_cli::{Class, Outcome};
 use graspd_rt::arm::{Joints, Model, READY};
 use graspd_rt::geom::{Pose, Vec3};

@@ -69,7 +69,12 @@ fn profiles_have_the_grasps_of_a_hand_count_and_a_scan_of_them_has_the_same() {
         let cad = f.list(&f.write("cad.stl", stl(&solid.corners())));
         assert_eq!(kept(&cad), brute(&solid, &JAW, true), "{name}");
         assert_eq!(kept(&cad).len(), count, "{name}");
-        let area: f64 = solid.corners().iter().map(|t| t.map(Vec3::from)).map(|[a, b, c]| 0.5 * (b - a).cross(&(c - a)).norm()).sum();
+        let area: f64 = solid
+            .corners()
+            .iter()
+            .map(|t| t.map(Vec3::from))
+            .map(|[a, b, c]| 0.5 * (b - a).cross(&(c - a)).norm())
+            .sum();
         let step = (2.0 * area / 112_000.0).sqrt();
         // Noise up to a third of a triangle's side, which turns its normal by 30 degrees and more.
         for noise in [0.02, 0.05, 0.1] {
@@ -84,11 +89,19 @@ fn profiles_have_the_grasps_of_a_hand_count_and_a_scan_of_them_has_the_same() {
                 let at = (back * Point3::from(scan.mesh_from_gripper.translation.vector)).coords;
                 let off = (at - cad.mesh_from_gripper.translation.vector).dot(&cad.closing).abs();
                 let (c, w) = (back.rotation * scan.closing, back.rotation * scan.approach);
-                c.dot(&cad.closing).abs() > 0.999 && w.dot(&cad.approach) > 0.995 && (scan.width - cad.width).abs() < 0.2 && off < 0.2e-3
+                c.dot(&cad.closing).abs() > 0.999
+                    && w.dot(&cad.approach) > 0.995
+                    && (scan.width - cad.width).abs() < 0.2
+                    && off < 0.2e-3
             };
             let free = |rows: &[Row]| rows.iter().filter(|r| r.free).cloned().collect::<Vec<_>>();
             for c in free(&cad) {
-                assert!(free(&rows).iter().any(|s| same(&s, &c)), "{name}, noise {noise}: missed {:?} {:?}", c.closing, c.approach);
+                assert!(
+                    free(&rows).iter().any(|s| same(&s, &c)),
+                    "{name}, noise {noise}: missed {:?} {:?}",
+                    c.closing,
+                    c.approach
+                );
             }
             for s in free(&rows) {
                 assert!(free(&cad).iter().any(|c| same(&&s, c)), "{name}, noise {noise}: {:?} is new", key(&s));
@@ -158,7 +171,11 @@ fn every_way_of_writing_a_part_is_read_alike() {
     words += " endsolid a solid end";
     same("one.stl", words.as_bytes());
     same("return.stl", words.replace(" facet normal", "\rfacet normal").replace(" vertex", "\r\r vertex").as_bytes());
-    let upper = words.to_uppercase().replace(" VERTEX", "\r\n\t\tVERTEX\t").replace("SOLID A PART OF FACETS", "\n  SOLID\n").replace(" ENDSOLID A SOLID END", "\r\nENDSOLID");
+    let upper = words
+        .to_uppercase()
+        .replace(" VERTEX", "\r\n\t\tVERTEX\t")
+        .replace("SOLID A PART OF FACETS", "\n  SOLID\n")
+        .replace(" ENDSOLID A SOLID END", "\r\nENDSOLID");
     same("tabs.stl", upper.as_bytes());
     let mut binary = stl(&solid.corners());
     binary[..30].copy_from_slice(b"solid facet normal vertex loop");
@@ -231,7 +248,9 @@ fn prisms_and_round_parts() {
     }
     let round = |angle: i32| {
         let (s, c) = f64::from(angle).to_radians().sin_cos();
-        cylinder.iter().any(|r| r.free && r.closing.z.abs() > 0.999 && r.approach.x * c + r.approach.y * s > 25f64.to_radians().cos())
+        cylinder.iter().any(|r| {
+            r.free && r.closing.z.abs() > 0.999 && r.approach.x * c + r.approach.y * s > 25f64.to_radians().cos()
+        })
     };
     assert!((0..360).step_by(10).all(round), "a way in to the ends is missing");
     // A tube of 72 and 60 mm: too wide across, but its wall of 6 mm can be taken all round, one claw in the bore.
@@ -246,7 +265,12 @@ fn prisms_and_round_parts() {
     for k in 0..n {
         let l = (k + 1) % n;
         // Outer wall, inner wall, bottom, top.
-        for q in [[k, l, 2 * n + l, 2 * n + k], [n + l, n + k, 3 * n + k, 3 * n + l], [l, k, n + k, n + l], [2 * n + k, 2 * n + l, 3 * n + l, 3 * n + k]] {
+        for q in [
+            [k, l, 2 * n + l, 2 * n + k],
+            [n + l, n + k, 3 * n + k, 3 * n + l],
+            [l, k, n + k, n + l],
+            [2 * n + k, 2 * n + l, 3 * n + l, 3 * n + k],
+        ] {
             let _ = writeln!(tube, "f {} {} {} {}", q[0] + 1, q[1] + 1, q[2] + 1, q[3] + 1);
         }
     }
@@ -290,7 +314,8 @@ fn large_scans_of_anything_take_less_than_two_seconds() {
             let j = j % m;
             *at.entry((i, if i == 0 || i == n { 0 } else { j })).or_insert_with(|| {
                 let (t, p) = (std::f64::consts::PI * i as f64 / n as f64, std::f64::consts::TAU * j as f64 / m as f64);
-                let r = if name == "ball" { radius * t.sin() } else { (radius + 4.0 * (3.0 * t).sin()) * t.sin().sqrt() };
+                let r =
+                    if name == "ball" { radius * t.sin() } else { (radius + 4.0 * (3.0 * t).sin()) * t.sin().sqrt() };
                 let z = if name == "ball" { radius * t.cos() } else { 60.0 * t.cos() };
                 [r * p.cos(), r * p.sin(), z].map(|x| x + rng.random_range(-0.02..0.02))
             })

@@ -243,7 +243,10 @@ pub(crate) fn prism(outline: &[[f64; 2]], height: f64) -> String {
 }
 
 pub(crate) fn polygon(n: usize, radius: f64) -> Vec<[f64; 2]> {
-    (0..n).map(|k| (k as f64 * std::f64::consts::TAU / n as f64).sin_cos()).map(|(s, c)| [radius * c, radius * s]).collect()
+    (0..n)
+        .map(|k| (k as f64 * std::f64::consts::TAU / n as f64).sin_cos())
+        .map(|(s, c)| [radius * c, radius * s])
+        .collect()
 }
 
 /// A handle as the list tells it, millimetres, in the mesh's frame.
@@ -360,16 +363,27 @@ pub(crate) fn brute(solid: &Solid, jaw: &Jaw, strict: bool) -> BTreeSet<Key> {
     let cells = solid.cells();
     let mut out = BTreeSet::new();
     let meets = |b: &Block| cells.iter().any(|c| (0..3).all(|k| c[0][k] < b[1][k] && c[1][k] > b[0][k]));
-    for (c, a, plus) in (0..3).flat_map(|c| [(c, (c + 1) % 3, true), (c, (c + 1) % 3, false), (c, (c + 2) % 3, true), (c, (c + 2) % 3, false)]) {
+    for (c, a, plus) in (0..3).flat_map(|c| {
+        [(c, (c + 1) % 3, true), (c, (c + 1) % 3, false), (c, (c + 2) % 3, true), (c, (c + 2) % 3, false)]
+    }) {
         let b = 3 - c - a;
         let sign = if plus { 1.0 } else { -1.0 };
         let patches = [true, false].map(|up| solid.patches(c, up));
-        let planes = patches.clone().map(|p| p.iter().map(|(at, _)| (at * 10.0).round() as i64).collect::<BTreeSet<_>>());
-        for (top, bottom) in planes[0].iter().flat_map(|t| planes[1].iter().map(move |b| (*t, *b))).filter(|(t, b)| t > b) {
-            let on = |k: usize, plane: i64| patches[k].iter().filter(move |(at, _)| (at * 10.0).round() as i64 == plane).map(|p| p.1);
+        let planes =
+            patches.clone().map(|p| p.iter().map(|(at, _)| (at * 10.0).round() as i64).collect::<BTreeSet<_>>());
+        for (top, bottom) in
+            planes[0].iter().flat_map(|t| planes[1].iter().map(move |b| (*t, *b))).filter(|(t, b)| t > b)
+        {
+            let on = |k: usize, plane: i64| {
+                patches[k].iter().filter(move |(at, _)| (at * 10.0).round() as i64 == plane).map(|p| p.1)
+            };
             // What both faces share, as rectangles across and along the approach.
             let shared: Vec<[[f64; 2]; 2]> = on(0, top)
-                .flat_map(|p| on(1, bottom).map(move |q| [[0, 1, 2].map(|k| p[0][k].max(q[0][k])), [0, 1, 2].map(|k| p[1][k].min(q[1][k]))]))
+                .flat_map(|p| {
+                    on(1, bottom).map(move |q| {
+                        [[0, 1, 2].map(|k| p[0][k].max(q[0][k])), [0, 1, 2].map(|k| p[1][k].min(q[1][k]))]
+                    })
+                })
                 .filter(|r: &Block| r[1][a] > r[0][a] + 1e-9 && r[1][b] > r[0][b] + 1e-9)
                 .map(|r| {
                     let (x, y) = (sign * r[0][a], sign * r[1][a]);
@@ -395,7 +409,11 @@ pub(crate) fn brute(solid: &Solid, jaw: &Jaw, strict: bool) -> BTreeSet<Key> {
                 if shared.iter().map(common).sum::<f64>() < CONTACT * (1.0 + 0.3 * more) {
                     return false;
                 }
-                let near = shared.iter().filter(|r| r[0][0] < pad[1][0] && r[1][0] > pad[0][0]).map(|r| r[0][1]).fold(f64::INFINITY, f64::min);
+                let near = shared
+                    .iter()
+                    .filter(|r| r[0][0] < pad[1][0] && r[1][0] > pad[0][0])
+                    .map(|r| r[0][1])
+                    .fold(f64::INFINITY, f64::min);
                 if strict && tip - near > jaw.length - 1.3 {
                     return false;
                 }

@@ -144,7 +144,12 @@ pub fn html(plan: &Plan, picture: Option<&[u8]>) -> String {
 }
 
 /// The top of a report: title, warnings and the picture (a PNG's bytes) with what it shows in words.
-pub(in crate::offline) fn head(title: &str, set_point: u64, warnings: &[String], picture: Option<(&[u8], &str)>) -> String {
+pub(in crate::offline) fn head(
+    title: &str,
+    set_point: u64,
+    warnings: &[String],
+    picture: Option<(&[u8], &str)>,
+) -> String {
     let mut h = String::new();
     // Writing into a string cannot fail.
     let _ = write!(
@@ -233,7 +238,12 @@ fn ellipse_path(m: &Matrix2<f64>, scale: f64, cx: f64, cy: f64) -> String {
     s + "Z"
 }
 
-pub(in crate::offline) fn cross_plot(title: &str, unit: &str, axes: [&str; 2], shapes: &[(Matrix2<f64>, &str, &str)]) -> String {
+pub(in crate::offline) fn cross_plot(
+    title: &str,
+    unit: &str,
+    axes: [&str; 2],
+    shapes: &[(Matrix2<f64>, &str, &str)],
+) -> String {
     let (w, h) = (560.0, 300.0);
     let largest =
         shapes.iter().map(|(m, _, _)| m[(0, 0)].max(m[(1, 1)]).max(0.0).sqrt()).fold(1e-12, f64::max) * 2.45 * 1.15;

@@ -96,7 +96,11 @@ impl<'a> Bvh<'a> {
     /// Exact however the box is turned against its way: what it sweeps is a convex body with known axes, not a row of samples.
     pub fn touches_sweep(&self, b: &OrientedBox, way: &Vec3) -> bool {
         let r = b.frame_from_box.rotation.to_rotation_matrix();
-        let mut body = Zonotope { centre: b.frame_from_box.translation.vector + way * 0.5, half: [Vec3::zeros(); 4], axes: Vec::new() };
+        let mut body = Zonotope {
+            centre: b.frame_from_box.translation.vector + way * 0.5,
+            half: [Vec3::zeros(); 4],
+            axes: Vec::new(),
+        };
         for (k, h) in body.half.iter_mut().take(3).enumerate() {
             *h = r.matrix().column(k) * b.half[k];
         }
@@ -202,9 +206,7 @@ impl<'a> Bvh<'a> {
             }
             from <= to + 1e-12
         };
-        self.walk(&meets, &mut |t| {
-            crossing(a, &d, &self.mesh.corners(t)).is_some_and(|(at, _)| at >= t0 && at <= t1)
-        })
+        self.walk(&meets, &mut |t| crossing(a, &d, &self.mesh.corners(t)).is_some_and(|(at, _)| at >= t0 && at <= t1))
     }
 }
 
@@ -329,7 +331,8 @@ mod tests {
             let way = v(0.3);
             let boxes = |n: usize, grow: f64| {
                 (0..=n).any(|i| {
-                    let on = OrientedBox { half: b.half + Vec3::repeat(grow), ..b }.moved(&Pose::from(way * (i as f64 / n as f64)));
+                    let on = OrientedBox { half: b.half + Vec3::repeat(grow), ..b }
+                        .moved(&Pose::from(way * (i as f64 / n as f64)));
                     tree.touches(&on)
                 })
             };

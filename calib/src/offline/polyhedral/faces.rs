@@ -127,7 +127,8 @@ impl Ground {
         let links = Links::new(mesh, tree);
         let thin = 1e-5 * mesh.size().norm();
         let measure = |mesh: &Mesh| {
-            let (mut vector, mut centre, mut needle) = (Vec::with_capacity(n), Vec::with_capacity(n), Vec::with_capacity(n));
+            let (mut vector, mut centre, mut needle) =
+                (Vec::with_capacity(n), Vec::with_capacity(n), Vec::with_capacity(n));
             for t in 0..n {
                 let [a, b, c] = mesh.corners(t);
                 let x = (b - a).cross(&(c - a)) * 0.5;
@@ -281,7 +282,11 @@ impl Ground {
             let hits = tree.pierced(&get(&self.centre, *middle), &-f.normal);
             for hit in hits.into_iter().filter(|t| t != middle && get(&self.normal, *t).dot(&f.normal) <= -self.cos) {
                 let near = |g: &Face| (get(&self.centre, hit) - g.centre).dot(&g.normal).abs() <= self.distance;
-                if found.iter().chain(&out).any(|g| opposed(f, &g.normal) && near(g) && g.triangles.binary_search(&hit).is_ok()) {
+                if found
+                    .iter()
+                    .chain(&out)
+                    .any(|g| opposed(f, &g.normal) && near(g) && g.triangles.binary_search(&hit).is_ok())
+                {
                     continue;
                 }
                 mark += 1;

@@ -228,7 +228,9 @@ fn see_and_reach(from: &Judged, places: &[Place], tree: &Bvh<'_>, gripper: &Grip
             return j;
         }
     }
-    poses.retain(|p| s.reach.is_none_or(|a| a.follows(&(s.left_from_mesh * p.pose * back), &(s.left_from_mesh * p.pose))));
+    poses.retain(|p| {
+        s.reach.is_none_or(|a| a.follows(&(s.left_from_mesh * p.pose * back), &(s.left_from_mesh * p.pose)))
+    });
     if poses.is_empty() {
         j.reason = Some(Reason::Reach);
         return j;

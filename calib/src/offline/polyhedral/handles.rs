@@ -97,8 +97,7 @@ pub fn enumerate(mesh: &Mesh, faces: &[Face], opposition: &Opposition) -> Handle
                     *slot = Some(rim(mesh, f));
                 }
             }
-            let edges: Vec<Vec3> =
-                [i, j].iter().filter_map(|k| rims.get(*k)?.as_ref()).flatten().copied().collect();
+            let edges: Vec<Vec3> = [i, j].iter().filter_map(|k| rims.get(*k)?.as_ref()).flatten().copied().collect();
             for (overlap, ways) in overlaps(mesh, [a, b], &closing, &edges, opposition.area) {
                 let width = overlap.heights.iter().map(|h| h[0] - h[1]).sum::<f64>() / overlap.heights.len() as f64;
                 if width <= 1e-5 {

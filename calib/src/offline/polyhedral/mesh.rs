@@ -27,7 +27,8 @@ impl Mesh {
             hi = hi.sup(v);
         }
         let mut weld = Weld::new(lo, hi);
-        let (mut triangles, mut given) = (Vec::with_capacity(all.len()), HashSet::with_capacity_and_hasher(all.len(), Mix::default()));
+        let (mut triangles, mut given) =
+            (Vec::with_capacity(all.len()), HashSet::with_capacity_and_hasher(all.len(), Mix::default()));
         for t in &all {
             let mut ids = [0u32; 3];
             for (id, v) in ids.iter_mut().zip(t) {

@@ -108,7 +108,14 @@ const LEAST_CUT: f64 = 0.12;
 const MOST_CUT: f64 = 0.7;
 
 /// Where part and gripper are in both views, equally large in both.
-fn close_up(plan: &MeshPlan, mesh: &Mesh, placed: &Placed, whole: [&Picture; 2], rig: &RigFile, gripper: &GripperFile) -> [Cut; 2] {
+fn close_up(
+    plan: &MeshPlan,
+    mesh: &Mesh,
+    placed: &Placed,
+    whole: [&Picture; 2],
+    rig: &RigFile,
+    gripper: &GripperFile,
+) -> [Cut; 2] {
     let full = whole.map(|p| Cut { x: 0, y: 0, width: p.width(), height: p.height() });
     let (mut lo, mut hi) = (Vec3::repeat(f64::INFINITY), Vec3::repeat(f64::NEG_INFINITY));
     for v in &mesh.vertices {
@@ -248,10 +255,8 @@ const SCAN: usize = 20_000;
 
 /// Unit normals of the triangles; of a scan, averaged over those around.
 fn normals(mesh: &Mesh) -> Vec<Option<Vec3>> {
-    let mut out: Vec<Vec3> = (0..mesh.triangles.len())
-        .map(|t| mesh.corners(t))
-        .map(|[a, b, c]| (b - a).cross(&(c - a)))
-        .collect();
+    let mut out: Vec<Vec3> =
+        (0..mesh.triangles.len()).map(|t| mesh.corners(t)).map(|[a, b, c]| (b - a).cross(&(c - a))).collect();
     for _ in 0..if out.len() > SCAN { 2 } else { 0 } {
         let mut at = vec![Vec3::zeros(); mesh.vertices.len()];
         for (n, t) in out.iter().zip(&mesh.triangles) {

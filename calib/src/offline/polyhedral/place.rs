@@ -153,9 +153,8 @@ impl<'a> Setting<'a> {
             sides
         };
         let coarse = nearest_first((0..=steps as usize).map(|k| at(k as f64)).chain([middle]).collect());
-        let fine = nearest_first(
-            (0..steps as usize).flat_map(|k| [0.25, 0.5, 0.75].map(|f| at(k as f64 + f))).collect(),
-        );
+        let fine =
+            nearest_first((0..steps as usize).flat_map(|k| [0.25, 0.5, 0.75].map(|f| at(k as f64 + f))).collect());
         let mut failed: Option<(Reason, f64, Pose)> = None;
         let mut most = 0.0f64;
         let mut any = false;
@@ -164,8 +163,11 @@ impl<'a> Setting<'a> {
             if any && k >= count {
                 break;
             }
-            let mut strip: Vec<Cell> =
-                cells.iter().filter(|c| (c.side - side).abs() <= self.claw.half_width.max(0.5 * o.cell)).copied().collect();
+            let mut strip: Vec<Cell> = cells
+                .iter()
+                .filter(|c| (c.side - side).abs() <= self.claw.half_width.max(0.5 * o.cell))
+                .copied()
+                .collect();
             strip.sort_by(|a, b| a.depth.total_cmp(&b.depth));
             let mut found = Vec::new();
             for turned in [false, true] {
@@ -204,9 +206,8 @@ impl<'a> Setting<'a> {
         let (near, far) = (strip.first()?.depth - half, strip.last()?.depth + half);
         // The part may stand no further in than the fingers are long.
         let last = far.min(near + self.claw.length - PALM);
-        let contact = |tip: f64| {
-            strip.iter().filter(|c| c.depth <= tip && c.depth >= tip - self.claw.pad).count() as f64 * area
-        };
+        let contact =
+            |tip: f64| strip.iter().filter(|c| c.depth <= tip && c.depth >= tip - self.claw.pad).count() as f64 * area;
         *most = most.max(contact(last));
         // The shallowest tip that presses enough: as many cells as it takes.
         let needed = (self.s.contact / area - 1e-9).ceil().max(1.0) as usize;
@@ -215,7 +216,8 @@ impl<'a> Setting<'a> {
             return None;
         }
         let at = |tip: f64| self.at(side, tip, strip, turned, contact(tip));
-        let held = |p: &Result<Place, (Reason, f64, Pose)>| p.as_ref().is_ok_and(|p| p.contact >= self.s.contact - 1e-12);
+        let held =
+            |p: &Result<Place, (Reason, f64, Pose)>| p.as_ref().is_ok_and(|p| p.contact >= self.s.contact - 1e-12);
         let deep = at(last);
         if held(&deep) {
             return Some(deep);
@@ -240,9 +242,17 @@ impl<'a> Setting<'a> {
     }
 
     /// The place with the tips at a depth, if nothing is hit there or on the way.
-    fn at(&self, side: f64, tip: f64, strip: &[Cell], turned: bool, contact: f64) -> Result<Place, (Reason, f64, Pose)> {
+    fn at(
+        &self,
+        side: f64,
+        tip: f64,
+        strip: &[Cell],
+        turned: bool,
+        contact: f64,
+    ) -> Result<Place, (Reason, f64, Pose)> {
         let under = strip.iter().filter(|c| c.depth <= tip && c.depth >= tip - self.claw.pad);
-        let (top, bottom) = under.fold((f64::NEG_INFINITY, f64::INFINITY), |(a, b), c| (a.max(c.faces[0]), b.min(c.faces[1])));
+        let (top, bottom) =
+            under.fold((f64::NEG_INFINITY, f64::INFINITY), |(a, b), c| (a.max(c.faces[0]), b.min(c.faces[1])));
         let origin = if turned { side + self.claw.middle } else { side - self.claw.middle };
         let pose = self.pose(origin, tip - self.claw.tip, 0.5 * (top + bottom), turned);
         let width = top - bottom;

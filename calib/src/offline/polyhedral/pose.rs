@@ -112,7 +112,8 @@ pub fn fit(rig: &Rig, picked: &[Picked], limit_px: f64) -> Result<MeshPose, Pick
     if picked.len() < 3 {
         return Err(PickError::TooFew(picked.len()));
     }
-    let finite = |p: &Picked| [p.left.x, p.left.y, p.right.x, p.right.y].iter().chain(p.point.iter()).all(|v| v.is_finite());
+    let finite =
+        |p: &Picked| [p.left.x, p.left.y, p.right.x, p.right.y].iter().chain(p.point.iter()).all(|v| v.is_finite());
     if !picked.iter().all(finite) {
         return Err(PickError::Degenerate("a number is not finite"));
     }
@@ -211,8 +212,10 @@ fn explain(all: &Trial<'_>, known: &[usize], limit_px: f64) -> PickError {
             let centre = points.iter().sum::<Vec3>() / n as f64;
             points.iter().map(|p| (p - centre).norm_squared()).sum::<f64>().sqrt()
         };
-        let scale = size(&mut all.seen.iter().flatten().copied()) / size(&mut picked.iter().map(|p| p.point)).max(1e-300);
-        let with = |f: &dyn Fn(Vec3) -> Vec3| picked.iter().map(|p| Picked { point: f(p.point), ..*p }).collect::<Vec<_>>();
+        let scale =
+            size(&mut all.seen.iter().flatten().copied()) / size(&mut picked.iter().map(|p| p.point)).max(1e-300);
+        let with =
+            |f: &dyn Fn(Vec3) -> Vec3| picked.iter().map(|p| Picked { point: f(p.point), ..*p }).collect::<Vec<_>>();
         if (scale - 1.0).abs() > OTHER_SIZE && fits(&with(&|p| p * scale), all.seen) {
             return PickError::Scale(scale);
         }

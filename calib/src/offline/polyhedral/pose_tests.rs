@@ -105,7 +105,11 @@ fn a_wrong_pick_among_five_is_named() {
         let mut p = picks(&truth, 0.5, seed, &CORNERS[..n]);
         let k = seed as usize % n;
         let wrong = Pixel::new(20.0 * (seed as f64).cos(), 20.0 * (seed as f64).sin());
-        if seed % 2 == 0 { p[k].left += wrong } else { p[k].right += wrong }
+        if seed % 2 == 0 {
+            p[k].left += wrong
+        } else {
+            p[k].right += wrong
+        }
         match fit(&rig(), &p, 5.0) {
             Err(PickError::Outlier { worst, .. }) => assert_eq!(worst, k + 1, "{seed}"),
             Err(PickError::Behind(worst)) => assert_eq!(worst, k + 1, "{seed}"),
@@ -140,7 +144,8 @@ fn what_is_wrong_with_all_picks_is_said() {
             assert_eq!(e, PickError::Exchanged(i.min(j) + 1, i.max(j) + 1), "{seed}");
         }
         // A mirrored mesh, whichever way it is mirrored; a mesh read in the wrong unit.
-        let each = |f: &dyn Fn(Vec3) -> Vec3| good.iter().map(|p| Picked { point: f(p.point), ..*p }).collect::<Vec<_>>();
+        let each =
+            |f: &dyn Fn(Vec3) -> Vec3| good.iter().map(|p| Picked { point: f(p.point), ..*p }).collect::<Vec<_>>();
         for mirrored in [each(&|p| Vec3::new(p.x, -p.y, p.z)), each(&|p| -p), each(&|p| Vec3::new(p.y, p.x, p.z))] {
             assert_eq!(fit(&rig(), &mirrored, 5.0), Err(PickError::Mirrored), "{seed}");
         }

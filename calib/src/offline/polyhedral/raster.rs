@@ -80,7 +80,9 @@ impl Grid {
                 (index(l).ceil().max(0.0) as usize, if last < 0.0 { 0 } else { (last as usize + 1).min(self.size[k]) })
             };
             let ((x0, x1), (y0, y1)) = (range(0), range(1));
-            let turn = |s: &[f64; 3], e: &[f64; 3], q: &[f64; 2]| (e[0] - s[0]) * (q[1] - s[1]) - (e[1] - s[1]) * (q[0] - s[0]);
+            let turn = |s: &[f64; 3], e: &[f64; 3], q: &[f64; 2]| {
+                (e[0] - s[0]) * (q[1] - s[1]) - (e[1] - s[1]) * (q[0] - s[0])
+            };
             let whole = turn(&p[0], &p[1], &[p[2][0], p[2][1]]);
             if whole.abs() < 1e-18 {
                 continue;
@@ -115,9 +117,10 @@ impl Grid {
     fn around(&self, k: usize) -> impl Iterator<Item = usize> + '_ {
         let [w, h] = self.size.map(|s| s as i64);
         let (x, y) = (k as i64 % w, k as i64 / w);
-        (0..9).filter(|i| *i != 4).map(move |i| (x + i % 3 - 1, y + i / 3 - 1)).filter_map(move |(x, y)| {
-            (x >= 0 && y >= 0 && x < w && y < h).then_some((y * w + x) as usize)
-        })
+        (0..9)
+            .filter(|i| *i != 4)
+            .map(move |i| (x + i % 3 - 1, y + i / 3 - 1))
+            .filter_map(move |(x, y)| (x >= 0 && y >= 0 && x < w && y < h).then_some((y * w + x) as usize))
     }
 
     /// The connected parts of a set of cells.
@@ -282,10 +285,13 @@ mod tests {
         assert_eq!(grid.sides(&part(&|x, y| x > 5.0 && x < 60.0 && y > 7.0 && y < 10.0), 0.0).len(), 4);
         assert_eq!(grid.sides(&part(&|x, y| x < 20.0 || y < 20.0), 0.0).len(), 6);
         let (s, c) = 30f64.to_radians().sin_cos();
-        let turned = grid.sides(&part(&|x, y| {
-            let (x, y) = (x - 40.0, y - 40.0);
-            (x * c + y * s).abs() < 20.0 && (y * c - x * s).abs() < 20.0
-        }), 0.0);
+        let turned = grid.sides(
+            &part(&|x, y| {
+                let (x, y) = (x - 40.0, y - 40.0);
+                (x * c + y * s).abs() < 20.0 && (y * c - x * s).abs() < 20.0
+            }),
+            0.0,
+        );
         assert_eq!(turned.len(), 4);
         for [p, q] in turned {
             let (dx, dy) = (q[0] - p[0], q[1] - p[1]);

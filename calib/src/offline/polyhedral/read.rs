@@ -120,7 +120,9 @@ fn parse(bytes: &[u8], kind: &str, unit_m: f64) -> Result<MeshFile, Problem> {
         ));
     }
     if crowded > 0 {
-        notes.push(format!("{crowded} edges join more than two triangles: the mesh is not the surface of one solid there"));
+        notes.push(format!(
+            "{crowded} edges join more than two triangles: the mesh is not the surface of one solid there"
+        ));
     }
     if one_sided > 0 {
         notes.push(format!(

@@ -196,7 +196,9 @@ fn hollow_polygons_are_cut_within_their_outline() {
 
 #[test]
 fn pieces_and_hollows_are_turned_each_for_itself() {
-    let at = |t: Corners, s: f32, d: f32| -> Corners { t.iter().map(|t| t.map(|v| [v[0] * s + d, v[1] * s, v[2] * s])).collect() };
+    let at = |t: Corners, s: f32, d: f32| -> Corners {
+        t.iter().map(|t| t.map(|v| [v[0] * s + d, v[1] * s, v[2] * s])).collect()
+    };
     let flip = |t: Corners| -> Corners { t.iter().map(|t| [t[0], t[2], t[1]]).collect() };
     let volume = |t: &Corners| {
         let m = parse(&binary(t), "stl", 1e-3).unwrap().mesh;

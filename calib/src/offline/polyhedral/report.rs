@@ -50,12 +50,20 @@ fn part(h: &mut String, placed: &Placed) {
     row(h, "unit of the file", &format!("{} mm", m.unit_m * 1e3));
     row(h, "file", &format!("<code>{}</code>", escape(m.hash.get(..16).unwrap_or(&m.hash))));
     row(h, "place (left camera)", &format!("{} mm", vector(&pose.translation.vector, 1e3, 2)));
-    row(h, "rotation vector", &format!("{}&deg;", vector(&pose.rotation.scaled_axis(), 180.0 / std::f64::consts::PI, 2)));
+    row(
+        h,
+        "rotation vector",
+        &format!("{}&deg;", vector(&pose.rotation.scaled_axis(), 180.0 / std::f64::consts::PI, 2)),
+    );
     if let Some(c) = &placed.covariance {
         let sd = |k: usize| c[(k, k)].max(0.0).sqrt();
         let place = Vec3::new(sd(0), sd(1), sd(2));
         let turn = Vec3::new(sd(3), sd(4), sd(5)) * (180.0 / std::f64::consts::PI);
-        row(h, "its standard deviations", &format!("{} mm; {}&deg;, along and about the mesh's axes", vector(&place, 1e3, 2), vector(&turn, 1.0, 3)));
+        row(
+            h,
+            "its standard deviations",
+            &format!("{} mm; {}&deg;, along and about the mesh's axes", vector(&place, 1e3, 2), vector(&turn, 1.0, 3)),
+        );
     }
     let from = match m.rms_px {
         Some(rms) => format!("{} picked points, rms {rms:.2} px", m.picked.len()),
@@ -68,7 +76,11 @@ fn handle(h: &mut String, plan: &MeshPlan) {
     let (o, j) = (&plan.file.object, &plan.chosen);
     row(h, "width", &format!("{:.2} mm, jaws {:.2} mm open on the way in", j.handle.width * 1e3, j.opening * 1e3));
     row(h, "contact", &format!("{:.0} mm&sup2; a claw", j.contact * 1e6));
-    row(h, "closing, approach (mesh)", &format!("({}), ({})", vector(&j.handle.closing, 1.0, 3), vector(&j.handle.approach, 1.0, 3)));
+    row(
+        h,
+        "closing, approach (mesh)",
+        &format!("({}), ({})", vector(&j.handle.closing, 1.0, 3), vector(&j.handle.approach, 1.0, 3)),
+    );
     row(h, "grasp (left camera)", &format!("{} mm", vector(&Vec3::from(o.centre_m), 1e3, 2)));
     row(
         h,
@@ -110,7 +122,8 @@ fn picks(h: &mut String, placed: &Placed, rig: &RigFile) {
         .picked
         .iter()
         .map(|p| {
-            let p = Picked { point: Vec3::from(p.point_m), left: Pixel::from(p.left_px), right: Pixel::from(p.right_px) };
+            let p =
+                Picked { point: Vec3::from(p.point_m), left: Pixel::from(p.left_px), right: Pixel::from(p.right_px) };
             residuals(&rig.rig, &placed.left_from_mesh, &p)
         })
         .collect();
@@ -169,7 +182,12 @@ fn scatter(name: &str, points: &[(usize, Pixel)], rms: f64) -> String {
     let _ = write!(s, "<circle cx={cx} cy={cy} r={:.1} fill=none stroke=#2da44e stroke-width=1.5 />", rms * scale);
     for (k, p) in points {
         let (x, y) = (cx + p.x * scale, cy + p.y * scale);
-        let _ = write!(s, "<circle cx={x:.1} cy={y:.1} r=3 fill=#0969da /><text x={:.1} y={:.1}>{k}</text>", x + 5.0, y - 4.0);
+        let _ = write!(
+            s,
+            "<circle cx={x:.1} cy={y:.1} r=3 fill=#0969da /><text x={:.1} y={:.1}>{k}</text>",
+            x + 5.0,
+            y - 4.0
+        );
     }
     let _ = write!(s, "<text x=44 y=14 font-weight=600>{name}: u right, v down, px</text></svg>");
     s

@@ -29,7 +29,8 @@ pub(super) fn crumpled(links: &Links, vector: &[Vec3], needle: &[bool]) -> bool 
 /// triangles. Only good for telling what is flat.
 pub(super) fn relaxed(mesh: &Mesh, noise: f64) -> Mesh {
     let mut out = mesh.clone();
-    let mut edges: Vec<f64> = (0..mesh.triangles.len()).map(|t| mesh.corners(t)).map(|[a, b, _]| (b - a).norm()).collect();
+    let mut edges: Vec<f64> =
+        (0..mesh.triangles.len()).map(|t| mesh.corners(t)).map(|[a, b, _]| (b - a).norm()).collect();
     let ratio = noise / median(&mut edges).max(1e-300);
     let rounds = ((ratio - RELAX.0) * RELAX.1).ceil().clamp(0.0, RELAX.2) as usize;
     for _ in 0..rounds {
@@ -88,11 +89,8 @@ pub(super) fn noise(mesh: &Mesh) -> f64 {
         }
     }
     let twice = umbrella(mesh, &umbrella(mesh, &mesh.vertices));
-    let mut off: Vec<f64> = twice
-        .iter()
-        .zip(&normal)
-        .filter_map(|(d, m)| m.try_normalize(1e-300).map(|m| d.dot(&m).abs()))
-        .collect();
+    let mut off: Vec<f64> =
+        twice.iter().zip(&normal).filter_map(|(d, m)| m.try_normalize(1e-300).map(|m| d.dot(&m).abs())).collect();
     // Of independent noise, the twofold difference in a mesh of six neighbours has 1.36 times its deviation; 0.6745 of that is its median.
     median(&mut off) / (1.36 * 0.6745)
 }
@@ -102,7 +100,9 @@ fn umbrella(mesh: &Mesh, values: &[Vec3]) -> Vec<Vec3> {
     let mut sum = vec![(Vec3::zeros(), 0u32); values.len()];
     for [a, b, c] in &mesh.triangles {
         for (v, p, q) in [(a, b, c), (b, c, a), (c, a, b)] {
-            if let (Some(s), Some(p), Some(q)) = (sum.get_mut(*v as usize), values.get(*p as usize), values.get(*q as usize)) {
+            if let (Some(s), Some(p), Some(q)) =
+                (sum.get_mut(*v as usize), values.get(*p as usize), values.get(*q as usize))
+            {
                 s.0 += p + q;
                 s.1 += 2;
             }

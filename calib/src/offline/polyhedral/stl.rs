@@ -15,7 +15,10 @@ pub(super) fn read(bytes: &[u8]) -> Result<Vec<[Vec3; 3]>, Problem> {
     let head = String::from_utf8_lossy(start).to_ascii_lowercase();
     let stated = bytes.get(80..HEAD).and_then(|b| b.try_into().ok()).map(u32::from_le_bytes);
     let fits = stated.is_some_and(|n| bytes.len() == HEAD + EACH * n as usize);
-    if !fits && head.trim_start_matches('\u{feff}').trim_start().starts_with("solid") && (head.contains("facet") || head.contains("endsolid")) {
+    if !fits
+        && head.trim_start_matches('\u{feff}').trim_start().starts_with("solid")
+        && (head.contains("facet") || head.contains("endsolid"))
+    {
         return text(String::from_utf8_lossy(bytes).trim_start_matches('\u{feff}'));
     }
     let Some(count) = stated else {
@@ -121,7 +124,8 @@ fn text(text: &str) -> Result<Vec<[Vec3; 3]>, Problem> {
                 match xyz.as_slice() {
                     [x, y, z] if clean && xyz.iter().all(|v| v.is_finite()) => corners.push(Vec3::new(*x, *y, *z)),
                     _ => {
-                        let said: Vec<&str> = words.iter().skip(k - 1).take_while(|w| w.0 == line).take(6).map(|w| w.1).collect();
+                        let said: Vec<&str> =
+                            words.iter().skip(k - 1).take_while(|w| w.0 == line).take(6).map(|w| w.1).collect();
                         return Err(wrong(format!("\"{}\" is not a vertex with three finite numbers", said.join(" "))));
                     }
                 }

@@ -155,7 +155,9 @@ const MOST_PIECES: usize = 3000;
 /// A closed piece says so by the sign of its own volume, unless it is a hollow within another one: that goes with the piece round it. A piece
 /// with open edges is a part of a surface that other pieces complete: rays from either side of it count what they meet.
 fn inwards(mesh: &Mesh, pieces: &[Vec<u32>], whole: &[bool]) -> Vec<usize> {
-    let all = |mesh: &Mesh| if volume(mesh, 0..mesh.triangles.len() as u32) < 0.0 { (0..pieces.len()).collect() } else { Vec::new() };
+    let all = |mesh: &Mesh| {
+        if volume(mesh, 0..mesh.triangles.len() as u32) < 0.0 { (0..pieces.len()).collect() } else { Vec::new() }
+    };
     if pieces.len() == 1 || pieces.len() > MOST_PIECES {
         return all(mesh);
     }
