@@ -61,6 +61,25 @@ fn profiles() -> Vec<(&'static str, usize, Solid)> {
     ]
 }
 
+/// A scan, moved by a pose, has the grasps of the part and no others: closing line to 2.5 degrees, way in to 6, width and place to 0.2 mm.
+fn same_grasps(name: &str, scan: &[Row], cad: &[Row], pose: &Pose) {
+    let back = pose.inverse();
+    let same = |scan: &Row, cad: &Row| {
+        let at = (back * Point3::from(scan.mesh_from_gripper.translation.vector)).coords;
+        let off = (at - cad.mesh_from_gripper.translation.vector).dot(&cad.closing).abs();
+        let (c, w) = (back.rotation * scan.closing, back.rotation * scan.approach);
+        let along = c.dot(&cad.closing).abs() > 0.999 && w.dot(&cad.approach) > 0.995;
+        along && (scan.width - cad.width).abs() < 0.2 && off < 0.2e-3
+    };
+    let free = |rows: &[Row]| rows.iter().filter(|r| r.free).cloned().collect::<Vec<_>>();
+    for c in free(cad) {
+        assert!(free(scan).iter().any(|s| same(s, &c)), "{name}: missed {:?} {:?}", c.closing, c.approach);
+    }
+    for s in free(scan) {
+        assert!(free(cad).iter().any(|c| same(&s, c)), "{name}: {:?} {:?} is new", s.closing, s.approach);
+    }
+}
+
 #[test]
 fn profiles_have_the_grasps_of_a_hand_count_and_a_scan_of_them_has_the_same() {
     let f = Folder::new("profiles", &JAW);

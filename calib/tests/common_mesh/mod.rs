@@ -88,6 +88,11 @@ impl Solid {
             v.dedup();
             v
         });
+        Self::on(add, cut, lines)
+    }
+
+    /// The same on a lattice of its own.
+    fn on(add: Vec<Block>, cut: Vec<Block>, lines: [Vec<f64>; 3]) -> Self {
         let mut out = Self { add, cut, lines, full: Vec::new() };
         let n = [0, 1, 2].map(|k| out.lines[k].len() - 1);
         for i in 0..n[0] * n[1] * n[2] {
@@ -171,6 +176,19 @@ impl Solid {
 
     pub(crate) fn corners(&self) -> Corners {
         self.quads().iter().flat_map(|q| [[q[0], q[1], q[2]], [q[0], q[2], q[3]]]).collect()
+    }
+
+    /// A scan with triangles of very different sizes and shapes, as a decimated one has: cut along `n` random planes across each axis.
+    pub(crate) fn uneven(&self, n: usize, noise: f64, seed: u64) -> Corners {
+        use rand::RngExt;
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+        let lines = self.lines.clone().map(|mut l| {
+            let (lo, hi) = (l[0], l[l.len() - 1]);
+            l.extend((0..n).map(|_| rng.random_range(lo..hi)));
+            l.sort_by(f64::total_cmp);
+            l
+        });
+        Self::on(self.add.clone(), self.cut.clone(), lines).scan(1e9, noise, seed)
     }
 
     /// Its surface cut into triangles with sides of about `step` millimetres, each vertex off by Gaussian noise: a scan.

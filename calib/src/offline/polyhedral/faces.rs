@@ -41,8 +41,8 @@ pub struct Face {
 const SAME_PLANE: f64 = 0.9986;
 /// A triangle beside a face belongs to it when it lies in its plane and faces its side: cosine of 50 degrees, for the crumples of a scan.
 const SAME_SIDE: f64 = 0.643;
-/// The angle within which two faces are partners: 4 degrees, less than what makes them a handle.
-const PARTNER: f64 = 0.9976;
+/// The angle within which two faces are partners already: 6 degrees, as for a handle.
+const PARTNER: f64 = 0.9945;
 /// A region may not reach further from its plane than this, however noisy, metres.
 const MOST_DISTANCE: f64 = 1e-3;
 
@@ -281,12 +281,13 @@ impl Ground {
             let Some(middle) = f.triangles.iter().min_by(|a, b| off(a).total_cmp(&off(b))) else { continue };
             let hits = tree.pierced(&get(&self.centre, *middle), &-f.normal);
             for hit in hits.into_iter().filter(|t| t != middle && get(&self.normal, *t).dot(&f.normal) <= -self.cos) {
-                let near = |g: &Face| (get(&self.centre, hit) - g.centre).dot(&g.normal).abs() <= self.distance;
-                if found
-                    .iter()
-                    .chain(&out)
-                    .any(|g| opposed(f, &g.normal) && near(g) && g.triangles.binary_search(&hit).is_ok())
-                {
+                // It is found when the strip holds the triangle hit, or stands beside it.
+                let known = |g: &Face| {
+                    let d = get(&self.centre, hit) - g.centre;
+                    let beside = d.dot(&g.normal).abs() <= self.distance && d.norm_squared() <= g.area;
+                    opposed(f, &g.normal) && (beside || g.triangles.binary_search(&hit).is_ok())
+                };
+                if found.iter().chain(&out).any(known) {
                     continue;
                 }
                 mark += 1;

@@ -146,7 +146,7 @@ fn overlaps(mesh: &Mesh, faces: [&Face; 2], closing: &Vec3, edges: &[Vec3], leas
             cells: part.iter().map(|k| grid.at(*k)).collect(),
             heights: part.iter().map(|k| [get(&top, *k), get(&bottom, *k)]).collect(),
         };
-        let ways = ways_in(&overlap, &grid.sides(&part, ragged), &flat);
+        let ways = ways_in(&overlap, &grid.sides(&part, ragged), if ragged > 0.0 { &[] } else { &flat });
         out.push((overlap, ways));
     }
     out
@@ -181,8 +181,10 @@ const SAME_WAY: f64 = 0.35;
 const SIDE: (f64, f64) = (4e-3, 0.08);
 /// ... or when it is this part of the width: the end of a thin plate.
 const WHOLE_SIDE: f64 = 0.25;
+/// A side that is this near to a right angle with the longest one is taken to be at one: 10 degrees, what a scan's ragged corners do.
+const NEARLY_SQUARE: f64 = 0.175;
 
-/// Directions in which claws can come in: across each side of the overlap's outline, inwards. `edges` are those of the faces.
+/// Directions in which claws can come in: across each side of the overlap's outline, inwards. `edges` are those of the faces, where they are straight.
 fn ways_in(o: &Overlap, sides: &[[[f64; 2]; 2]], edges: &[[f64; 2]]) -> Vec<Vec3> {
     let apart = |a: f64, b: f64| (a - b + PI).rem_euclid(TAU) - PI;
     // Directions along the outline, the inside to the left, with their lengths; the longest first.
@@ -214,11 +216,17 @@ fn ways_in(o: &Overlap, sides: &[[[f64; 2]; 2]], edges: &[[f64; 2]]) -> Vec<Vec3
                 total += e[0].hypot(e[1]);
             }
         }
-        angle + if total > 0.5 * length { sum / total } else { 0.0 }
+        (total > 0.5 * length).then(|| angle + sum / total)
+    };
+    // A handle is a box: what is nearly square to its longest side is meant to be, where no straight edge says otherwise.
+    let main = ways.first().map_or(0.0, |(angle, length)| exact(*angle, *length).unwrap_or(*angle));
+    let square = |angle: f64| {
+        let off = (angle - main + 0.5 * FRAC_PI_2).rem_euclid(FRAC_PI_2) - 0.5 * FRAC_PI_2;
+        if off.abs() < NEARLY_SQUARE { angle - off } else { angle }
     };
     ways.iter()
         .map(|(angle, length)| {
-            let (s, c) = exact(*angle, *length).sin_cos();
+            let (s, c) = exact(*angle, *length).unwrap_or(square(*angle)).sin_cos();
             o.v * c - o.u * s
         })
         .collect()

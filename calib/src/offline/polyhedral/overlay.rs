@@ -67,7 +67,7 @@ pub fn draw(
             ("  marks", MARK),
             ("  picks", CLICK),
         ],
-        &caption(plan, placed),
+        &caption(plan, survey, placed),
         &plan.file.warnings,
     )
 }
@@ -274,7 +274,7 @@ fn normals(mesh: &Mesh) -> Vec<Option<Vec3>> {
 }
 
 /// The figures under the pictures.
-fn caption(plan: &MeshPlan, placed: &Placed) -> Vec<Vec<(&'static str, String)>> {
+fn caption(plan: &MeshPlan, survey: &Survey<'_>, placed: &Placed) -> Vec<Vec<(&'static str, String)>> {
     let mm = |v: f64| format!("{:.1}", v * 1e3);
     let (o, m, j) = (&plan.file.object, &placed.record, &plan.chosen);
     let [x, y, z] = m.size_m.map(mm);
@@ -294,10 +294,10 @@ fn caption(plan: &MeshPlan, placed: &Placed) -> Vec<Vec<(&'static str, String)>>
         ("picks", picks),
     ];
     let seen = |k: usize| plan.set_point.grasp.marks.get(k).map_or(0, |m| m.iter().flatten().count());
-    let taken = plan.file.candidate.iter().filter(|c| !c.verdict.starts_with("dropped")).count();
+    let taken = survey.handles.iter().filter(|j| j.reason.is_none()).count();
     let third = vec![
         ("marks", format!("{} left, {} right", seen(0), seen(1))),
-        ("handles", format!("{taken} of {} can be taken", plan.file.candidate.len())),
+        ("handles", format!("{taken} of {} can be taken", survey.handles.len())),
         ("grasp", format!("({}) mm", at(&plan.set_point.grasp.left_from_gripper))),
     ];
     vec![first, second, third]

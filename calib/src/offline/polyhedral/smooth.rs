@@ -4,15 +4,15 @@ use super::links::Links;
 use super::mesh::Mesh;
 use graspd_rt::geom::Vec3;
 
-/// Neighbours that typically differ by more than this are crumpled by noise: 2 degrees.
-const CRUMPLED: f64 = 0.035;
+/// A mesh is crumpled when more than the rest of this part of its triangles differs from every neighbour by more than this angle: 2 degrees.
+const CRUMPLED: (f64, f64) = (0.035, 0.85);
 /// Rounds of averaging for a mesh whose neighbours agree, and for a crumpled one.
 const ROUNDS: [usize; 2] = [2, 24];
 
 /// Noise, in lengths of an edge, up to which averaging normals is enough, and rounds of moving vertices for what is beyond it.
 const RELAX: (f64, f64, f64) = (0.1, 40.0, 10.0);
 
-/// Whether a mesh is crumpled by noise: a triangle's best neighbour typically differs from it.
+/// Whether a mesh is crumpled by noise: many triangles differ from their best neighbour. A CAD part's have one in their own plane.
 pub(super) fn crumpled(links: &Links, vector: &[Vec3], needle: &[bool]) -> bool {
     let unit = |t: u32| vector.get(t as usize).and_then(|v| v.try_normalize(1e-300));
     let is_needle = |t: u32| needle.get(t as usize).copied().unwrap_or(false);
@@ -22,7 +22,7 @@ pub(super) fn crumpled(links: &Links, vector: &[Vec3], needle: &[bool]) -> bool 
         let near = links.of(t).iter().filter(|k| !is_needle(**k)).filter_map(|k| unit(*k));
         angles.extend(near.map(|o| (o - own).norm()).min_by(f64::total_cmp));
     }
-    median(&mut angles) > CRUMPLED
+    quantile(&mut angles, CRUMPLED.1) > CRUMPLED.0
 }
 
 /// A crumpled mesh with its vertices moved to the middle of their neighbours a few times: the noise goes, and so does what is sharper than a few
@@ -112,9 +112,13 @@ fn umbrella(mesh: &Mesh, values: &[Vec3]) -> Vec<Vec3> {
 }
 
 fn median(v: &mut [f64]) -> f64 {
-    let half = v.len() / 2;
+    quantile(v, 0.5)
+}
+
+fn quantile(v: &mut [f64], part: f64) -> f64 {
+    let at = ((v.len() as f64 * part) as usize).min(v.len().saturating_sub(1));
     if v.is_empty() {
         return 0.0;
     }
-    *v.select_nth_unstable_by(half, f64::total_cmp).1
+    *v.select_nth_unstable_by(at, f64::total_cmp).1
 }
