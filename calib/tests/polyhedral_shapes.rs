@@ -103,29 +103,11 @@ fn profiles_have_the_grasps_of_a_hand_count_and_a_scan_of_them_has_the_same() {
             let from = std::time::Instant::now();
             let rows = f.list(&path);
             println!("{name}, noise {noise} mm: {} triangles in {:.2} s", corners.len(), from.elapsed().as_secs_f64());
-            let back = pose.inverse();
-            let same = |scan: &&Row, cad: &Row| {
-                let at = (back * Point3::from(scan.mesh_from_gripper.translation.vector)).coords;
-                let off = (at - cad.mesh_from_gripper.translation.vector).dot(&cad.closing).abs();
-                let (c, w) = (back.rotation * scan.closing, back.rotation * scan.approach);
-                c.dot(&cad.closing).abs() > 0.999
-                    && w.dot(&cad.approach) > 0.995
-                    && (scan.width - cad.width).abs() < 0.2
-                    && off < 0.2e-3
-            };
-            let free = |rows: &[Row]| rows.iter().filter(|r| r.free).cloned().collect::<Vec<_>>();
-            for c in free(&cad) {
-                assert!(
-                    free(&rows).iter().any(|s| same(&s, &c)),
-                    "{name}, noise {noise}: missed {:?} {:?}",
-                    c.closing,
-                    c.approach
-                );
-            }
-            for s in free(&rows) {
-                assert!(free(&cad).iter().any(|c| same(&&s, c)), "{name}, noise {noise}: {:?} is new", key(&s));
-            }
+            same_grasps(&format!("{name}, noise {noise}"), &rows, &cad, &pose);
         }
+        // Triangles of all sizes and shapes.
+        let corners = moved(&solid.uneven(75, 0.04, n as u64), &pose);
+        same_grasps(&format!("{name}, uneven"), &f.list(&f.write("uneven.stl", stl(&corners))), &cad, &pose);
     }
 }
 
