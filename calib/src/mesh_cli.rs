@@ -6,11 +6,11 @@ use crate::files::{
 };
 use crate::offline::edges::picture::Picture;
 use crate::offline::polyhedral::filter::Judged;
-use crate::offline::polyhedral::overlay;
 use crate::offline::polyhedral::plan::{MeshOptions, MeshPlan, MeshPlanError, Placed, Survey, survey};
 use crate::offline::polyhedral::pose::{Picked, fit};
 use crate::offline::polyhedral::reach::Arm;
 use crate::offline::polyhedral::read::{MeshFile, load, unit};
+use crate::offline::polyhedral::{overlay, report};
 use crate::plan_cli::{Class, Outcome};
 use graspd_rt::arm::{Joints, Model, READY};
 use graspd_rt::geom::{Pose, Vec3};
@@ -67,6 +67,8 @@ pub struct MeshRequest {
     pub out: Option<PathBuf>,
     /// Where to write the picture.
     pub overlay: Option<PathBuf>,
+    /// Where to write the one-page report.
+    pub report: Option<PathBuf>,
 }
 
 type Failure = (Class, &'static str, String);
@@ -304,11 +306,19 @@ fn finish(
     if let Some(path) = &r.out {
         plan.file.save(path).map_err(file)?;
     }
-    if let Some(path) = &r.overlay {
-        let refuse = |reason: String| file(FileError::Write { path: path.display().to_string(), reason });
-        let drawn = overlay::draw(&plan, found, &m.mesh, placed, pictures.map(|[l, s]| [l, s]), rig, gripper)
-            .ok_or_else(|| refuse("the drawing is too large".to_owned()))?;
-        std::fs::write(path, drawn).map_err(|e| refuse(e.to_string()))?;
+    if r.overlay.is_some() || r.report.is_some() {
+        let drawn = overlay::draw(&plan, found, &m.mesh, placed, pictures.map(|[l, s]| [l, s]), rig, gripper);
+        let write = |path: &Path, bytes: Option<&[u8]>| {
+            let refuse = |reason: String| file(FileError::Write { path: path.display().to_string(), reason });
+            let bytes = bytes.ok_or_else(|| refuse("the drawing is too large".to_owned()))?;
+            std::fs::write(path, bytes).map_err(|e| refuse(e.to_string()))
+        };
+        if let Some(path) = &r.overlay {
+            write(path, drawn.as_deref())?;
+        }
+        if let Some(path) = &r.report {
+            write(path, Some(report::html(&plan, found, placed, rig, drawn.as_deref()).as_bytes()))?;
+        }
     }
     let (o, j) = (&plan.file.object, &plan.chosen);
     let mut text = summary(m, found);
@@ -365,7 +375,9 @@ fn table(found: &Survey<'_>) -> String {
     let mut out =
         String::from("  N  width mm  closing (mesh)         approach (mesh)        contact mm2  marks  verdict\n");
     for (k, j) in found.handles.iter().enumerate() {
-        let v = |x: &Vec3| format!("({:>5.2}, {:>5.2}, {:>5.2})", x.x + 0.0, x.y + 0.0, x.z + 0.0);
+        // No minus before a nought that is only rounding error.
+        let n = |x: f64| if x.abs() < 0.005 { 0.0 } else { x };
+        let v = |x: &Vec3| format!("({:>5.2}, {:>5.2}, {:>5.2})", n(x.x), n(x.y), n(x.z));
         out += &format!(
             "{:>3}  {:>8.1}  {}  {}  {:>11.0}  {:>2} {:>2}  {}\n",
             k + 1,

@@ -229,6 +229,42 @@ fn one_wrong_pick_is_named_and_too_few_are_refused() {
     assert_eq!(run(&f.request(&mesh)).class, Class::Usage);
 }
 
+#[test]
+fn the_report_is_one_page_that_tells_all() {
+    let f = Folder::new("report");
+    let mesh = f.write("part.stl", stl(&stepped()));
+    let page = |name: &str, r: MeshRequest| {
+        let path = f.0.join(name);
+        let o = run(&MeshRequest { report: Some(path.clone()), ..r });
+        done(&o);
+        (std::fs::read_to_string(&path).unwrap(), o)
+    };
+    let picked = MeshRequest { picks: picks(0.5, 2), ..f.request(&mesh) };
+    let (html, o) = page("a.html", picked.clone());
+    assert!(html == page("b.html", picked).0, "the same input gave another page");
+    // Nothing is fetched, the picture is in it, both views' residuals and both ellipses are drawn.
+    assert!(!html.contains("http") && !html.contains("<script") && html.contains("data:image/png;base64,"));
+    assert_eq!(html.matches("<svg").count(), 4);
+    assert!(html.contains(o.json["set_point"].as_str().unwrap()));
+    // A row for each pick and each handle, in the order of the list, every reason in full.
+    let rows = o.json["handles"].as_array().unwrap();
+    let table = html.split("<h2>Handles").nth(1).unwrap();
+    assert_eq!(table.matches("<tr><td>").count(), rows.len());
+    assert_eq!(
+        html.split("<h2>Uncertainty").next().unwrap().split("<h2>Picked").nth(1).unwrap().matches("<tr><td>").count(),
+        8
+    );
+    let mut from = 0;
+    for r in rows {
+        let verdict = r["reason"].as_str().map_or(String::from("possible"), |t| format!("dropped: {t}"));
+        let verdict = if r["number"] == 1 { String::from("chosen") } else { verdict };
+        from += table[from..].find(&verdict).unwrap_or_else(|| panic!("{verdict}"));
+    }
+    // A pose from a file has no picks to show; without its sigma no ellipse either.
+    let (html, _) = page("c.html", posed(&f, &mesh));
+    assert!(!html.contains("<h2>Picked") && html.matches("<svg").count() == 2);
+}
+
 fn posed(f: &Folder, mesh: &Path) -> MeshRequest {
     let v = truth().rotation.scaled_axis();
     let t = truth().translation.vector;

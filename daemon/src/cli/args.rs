@@ -202,7 +202,7 @@ pub struct PlanArgs {
     #[arg(long, value_name = "plan.png")]
     pub overlay: Option<PathBuf>,
     /// Where to write a one-page report
-    #[arg(long, value_name = "plan.html", conflicts_with = "mesh")]
+    #[arg(long, value_name = "plan.html")]
     pub report: Option<PathBuf>,
     /// One JSON object on standard output
     #[arg(long)]

@@ -44,7 +44,7 @@ pub struct MeshArgs {
     #[arg(long, value_name = "POSE", requires = "arm", allow_hyphen_values = true)]
     pub base: Option<String>,
     /// Only list the handles, ranked, with the reason for each that is dropped; write nothing
-    #[arg(long, requires = "mesh", conflicts_with_all = ["out", "overlay", "handle"])]
+    #[arg(long, requires = "mesh", conflicts_with_all = ["out", "overlay", "report", "handle"])]
     pub list: bool,
     /// Plan for this handle of the list instead of the best
     #[arg(long, value_name = "N", requires = "mesh")]
@@ -82,5 +82,6 @@ pub(super) fn plan(args: &PlanArgs) -> Outcome {
         handle: part.handle,
         out: args.out.clone(),
         overlay: args.overlay.clone(),
+        report: args.report.clone(),
     })
 }

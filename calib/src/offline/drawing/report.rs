@@ -2,8 +2,7 @@
 
 use crate::offline::contour::Contour;
 use crate::offline::plan::Plan;
-use crate::offline::rim::model::Reconstruction;
-use nalgebra::Matrix2;
+use nalgebra::{Matrix2, Matrix3};
 use std::f64::consts::TAU;
 use std::fmt::Write;
 
@@ -20,25 +19,12 @@ svg{width:100%;height:auto}small{color:#57606a}code{font-size:.85em}\
 pub fn html(plan: &Plan, picture: Option<&[u8]>) -> String {
     let o = &plan.file.object;
     let r = &plan.reconstruction;
-    let mut h = String::new();
-    // Writing into a string cannot fail.
-    let _ = write!(
-        h,
-        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content=\"width=device-width\"><title>graspd plan</title><style>{STYLE}</style>\
-         <h1>Grasp on a {}</h1><small>set-point <code>{:016x}</code></small>",
-        escape(&o.model),
-        plan.set_point.id
+    let mut h = head(
+        &format!("Grasp on a {}", o.model),
+        plan.set_point.id,
+        &plan.file.warnings,
+        picture.map(|png| (png, "both views with rim, normal, gripper and marks")),
     );
-    for w in &plan.file.warnings {
-        let _ = write!(h, "<div class=note>{}</div>", escape(w));
-    }
-    if let Some(png) = picture {
-        let _ = write!(
-            h,
-            "<p><img alt=\"both views with rim, normal, gripper and marks\" src=\"data:image/png;base64,{}\">",
-            base64(png)
-        );
-    }
     h += "<div class=two><div><h2>Rim</h2><table>";
     let mm = |v: f64| format!("{:.3} mm", v * 1e3);
     let c = r.rim.centre * 1e3;
@@ -138,7 +124,7 @@ pub fn html(plan: &Plan, picture: Option<&[u8]>) -> String {
         let _ = write!(h, "<div>{}</div>", residual_plot(name, c));
     }
     h += "</div><h2>Uncertainty</h2><small>ellipses that hold the truth with 95 % probability</small><div class=two>";
-    let _ = write!(h, "<div>{}</div><div>{}</div></div>", centre_plot(r), normal_plot(r));
+    let _ = write!(h, "<div>{}</div><div>{}</div></div>", centre_plot(&r.cov_centre), normal_plot(&r.cov_normal));
     h += "<h2>Candidates</h2><table><tr><th>angle<th>jaws<th>visibility left, right<th>marks<th>verdict</tr>";
     for c in &plan.file.candidate {
         let _ = write!(
@@ -157,16 +143,40 @@ pub fn html(plan: &Plan, picture: Option<&[u8]>) -> String {
     h
 }
 
-fn row(h: &mut String, key: &str, value: &str) {
+/// The top of a report: title, warnings and the picture (a PNG's bytes) with what it shows in words.
+pub(in crate::offline) fn head(
+    title: &str,
+    set_point: u64,
+    warnings: &[String],
+    picture: Option<(&[u8], &str)>,
+) -> String {
+    let mut h = String::new();
+    // Writing into a string cannot fail.
+    let _ = write!(
+        h,
+        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content=\"width=device-width\"><title>graspd plan</title><style>{STYLE}</style>\
+         <h1>{}</h1><small>set-point <code>{set_point:016x}</code></small>",
+        escape(title)
+    );
+    for w in warnings {
+        let _ = write!(h, "<div class=note>{}</div>", escape(w));
+    }
+    if let Some((png, alt)) = picture {
+        let _ = write!(h, "<p><img alt=\"{alt}\" src=\"data:image/png;base64,{}\">", base64(png));
+    }
+    h
+}
+
+pub(in crate::offline) fn row(h: &mut String, key: &str, value: &str) {
     let _ = write!(h, "<tr><th>{key}<td>{value}</tr>");
 }
 
-fn escape(s: &str) -> String {
+pub(in crate::offline) fn escape(s: &str) -> String {
     s.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
 /// A step of 1, 2 or 5 times a power of ten that divides a span in a few parts.
-fn tick(span: f64) -> f64 {
+pub(in crate::offline) fn tick(span: f64) -> f64 {
     let p = 10f64.powf((span.max(1e-12) / 4.0).log10().floor());
     [1.0, 2.0, 5.0, 10.0].into_iter().map(|k| k * p).find(|s| span / s <= 5.0).unwrap_or(10.0 * p)
 }
@@ -228,7 +238,12 @@ fn ellipse_path(m: &Matrix2<f64>, scale: f64, cx: f64, cy: f64) -> String {
     s + "Z"
 }
 
-fn cross_plot(title: &str, unit: &str, axes: [&str; 2], shapes: &[(Matrix2<f64>, &str, &str)]) -> String {
+pub(in crate::offline) fn cross_plot(
+    title: &str,
+    unit: &str,
+    axes: [&str; 2],
+    shapes: &[(Matrix2<f64>, &str, &str)],
+) -> String {
     let (w, h) = (560.0, 300.0);
     let largest =
         shapes.iter().map(|(m, _, _)| m[(0, 0)].max(m[(1, 1)]).max(0.0).sqrt()).fold(1e-12, f64::max) * 2.45 * 1.15;
@@ -276,8 +291,8 @@ fn cross_plot(title: &str, unit: &str, axes: [&str; 2], shapes: &[(Matrix2<f64>,
     s
 }
 
-fn centre_plot(r: &Reconstruction) -> String {
-    let part = |i: usize, j: usize| r.cov_centre.fixed_view::<1, 1>(i, j)[0] * 1e6;
+pub(in crate::offline) fn centre_plot(covariance: &Matrix3<f64>) -> String {
+    let part = |i: usize, j: usize| covariance[(i, j)] * 1e6;
     let m = |i: usize, j: usize| Matrix2::new(part(i, i), part(i, j), part(j, i), part(j, j));
     cross_plot(
         "centre",
@@ -287,9 +302,9 @@ fn centre_plot(r: &Reconstruction) -> String {
     )
 }
 
-fn normal_plot(r: &Reconstruction) -> String {
+pub(in crate::offline) fn normal_plot(covariance: &Matrix2<f64>) -> String {
     let k = 180.0 / std::f64::consts::PI;
-    cross_plot("normal", "degrees", ["e1", "e2"], &[(r.cov_normal * k * k, "#bc4c00", "tilt about the plane's axes")])
+    cross_plot("normal", "degrees", ["e1", "e2"], &[(covariance * k * k, "#bc4c00", "tilt about the plane's axes")])
 }
 
 fn base64(data: &[u8]) -> String {

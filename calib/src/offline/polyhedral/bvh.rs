@@ -3,7 +3,6 @@
 use super::mesh::Mesh;
 use crate::files::OrientedBox;
 use graspd_rt::geom::Vec3;
-use nalgebra::Point3;
 
 /// Triangles of a leaf.
 const LEAF: usize = 6;
@@ -89,15 +88,98 @@ impl<'a> Bvh<'a> {
 
     /// Whether a box (in the mesh's frame) touches any triangle.
     pub fn touches(&self, b: &OrientedBox) -> bool {
-        let corners = b.corners();
-        let lo = corners.iter().fold(Vec3::repeat(f64::INFINITY), |a, c| a.inf(c));
-        let hi = corners.iter().fold(Vec3::repeat(f64::NEG_INFINITY), |a, c| a.sup(c));
-        let inverse = b.frame_from_box.inverse();
-        let meets = |l: &Vec3, h: &Vec3| (0..3).all(|k| l[k] <= hi[k] && h[k] >= lo[k]);
+        self.touches_sweep(b, &Vec3::zeros())
+    }
+
+    /// Whether a box touches any triangle anywhere on its straight way from where it stands to `way` (metres, mesh's frame) from there.
+    ///
+    /// Exact however the box is turned against its way: what it sweeps is a convex body with known axes, not a row of samples.
+    pub fn touches_sweep(&self, b: &OrientedBox, way: &Vec3) -> bool {
+        let r = b.frame_from_box.rotation.to_rotation_matrix();
+        let mut body = Zonotope {
+            centre: b.frame_from_box.translation.vector + way * 0.5,
+            half: [Vec3::zeros(); 4],
+            axes: Vec::new(),
+        };
+        for (k, h) in body.half.iter_mut().take(3).enumerate() {
+            *h = r.matrix().column(k) * b.half[k];
+        }
+        body.half[3] = way * 0.5;
+        body.find_axes();
+        let reach = body.half.iter().fold(Vec3::zeros(), |a, h| a + h.abs());
+        let (lo, hi) = (body.centre - reach, body.centre + reach);
+        let meets = |l: &Vec3, h: &Vec3| {
+            (0..3).all(|k| l[k] <= hi[k] && h[k] >= lo[k]) && body.meets_box(&((l + h) * 0.5), &((h - l) * 0.5))
+        };
+        self.walk(&meets, &mut |t| body.touches(&self.mesh.corners(t)))
+    }
+
+    /// Calls `found` with every triangle whose bounding box comes within `radius` (metres) of a point.
+    pub fn near(&self, p: &Vec3, radius: f64, mut found: impl FnMut(u32)) {
+        let meets = |l: &Vec3, h: &Vec3| (0..3).all(|k| l[k] <= p[k] + radius && h[k] >= p[k] - radius);
         self.walk(&meets, &mut |t| {
-            let local = self.mesh.corners(t).map(|v| (inverse * Point3::from(v)).coords);
-            box_touches_triangle(&b.half, &local)
-        })
+            let [a, b, c] = self.mesh.corners(t);
+            if meets(&a.inf(&b).inf(&c), &a.sup(&b).sup(&c)) {
+                found(t as u32);
+            }
+            false
+        });
+    }
+
+    /// Whether a point lies in the solid. Rays in several directions vote by the side from which they meet the surface first, so that a hole in
+    /// it or a few wrong windings do not decide.
+    pub fn encloses(&self, p: &Vec3) -> bool {
+        let inside = RAYS.iter().filter(|d| self.first_hit(p, &Vec3::from(**d)).is_some_and(|leaves| leaves)).count();
+        2 * inside > RAYS.len() + 1
+    }
+
+    /// Whether a point is told to be inside by how often rays from it meet those triangles of a closed surface that `counts`.
+    pub fn odd(&self, p: &Vec3, counts: impl Fn(u32) -> bool) -> bool {
+        let odd = |d: &[f64; 3]| {
+            let mut n = 0;
+            self.ray(p, &Vec3::from(*d), |t, _, _| n += usize::from(counts(t)));
+            n % 2 == 1
+        };
+        RAYS.iter().take(3).filter(|d| odd(d)).count() > 1
+    }
+
+    /// Every triangle that a ray meets.
+    pub fn pierced(&self, p: &Vec3, direction: &Vec3) -> Vec<u32> {
+        let mut out = Vec::new();
+        self.ray(p, direction, |t, _, _| out.push(t));
+        out.sort_unstable();
+        out
+    }
+
+    /// Whether the first triangle that a ray meets is met from its inner side; `None` when there is none.
+    fn first_hit(&self, p: &Vec3, direction: &Vec3) -> Option<bool> {
+        let mut first: Option<(f64, bool)> = None;
+        self.ray(p, direction, |_, at, leaves| {
+            if first.is_none_or(|f| at < f.0) {
+                first = Some((at, leaves));
+            }
+        });
+        first.map(|f| f.1)
+    }
+
+    /// Calls `hit` with the triangle and the distance of every crossing of a ray and whether it leaves the solid there by the triangle's normal.
+    fn ray(&self, p: &Vec3, d: &Vec3, mut hit: impl FnMut(u32, f64, bool)) {
+        let inverse = d.map(|x| 1.0 / x);
+        let meets = |lo: &Vec3, hi: &Vec3| {
+            let (mut from, mut to) = (0.0f64, f64::INFINITY);
+            for k in 0..3 {
+                let (u, v) = ((lo[k] - p[k]) * inverse[k], (hi[k] - p[k]) * inverse[k]);
+                from = from.max(u.min(v));
+                to = to.min(u.max(v));
+            }
+            from <= to * (1.0 + 1e-12)
+        };
+        self.walk(&meets, &mut |t| {
+            if let Some((at, det)) = crossing(p, d, &self.mesh.corners(t)).filter(|(at, _)| *at > 0.0) {
+                hit(t as u32, at, det < 0.0);
+            }
+            false
+        });
     }
 
     /// Whether the segment from `a` to `b` meets the mesh, away from its ends by `skin` (metres).
@@ -124,48 +206,108 @@ impl<'a> Bvh<'a> {
             }
             from <= to + 1e-12
         };
-        self.walk(&meets, &mut |t| {
-            let [p, q, r] = self.mesh.corners(t);
-            let (e1, e2) = (q - p, r - p);
-            let h = d.cross(&e2);
-            let det = e1.dot(&h);
-            if det.abs() < 1e-18 {
-                return false;
-            }
-            let s = a - p;
-            let u = s.dot(&h) / det;
-            let w = s.cross(&e1);
-            let v = d.dot(&w) / det;
-            let at = e2.dot(&w) / det;
-            u >= 0.0 && v >= 0.0 && u + v <= 1.0 && at >= t0 && at <= t1
-        })
+        self.walk(&meets, &mut |t| crossing(a, &d, &self.mesh.corners(t)).is_some_and(|(at, _)| at >= t0 && at <= t1))
     }
 }
 
-/// Separating axes of a box at the origin and a triangle (Akenine-Moller): touching when none of the thirteen separates them.
-fn box_touches_triangle(half: &Vec3, t: &[Vec3; 3]) -> bool {
-    let apart = |axis: &Vec3| {
-        let p = t.map(|v| v.dot(axis));
-        let reach = half.x * axis.x.abs() + half.y * axis.y.abs() + half.z * axis.z.abs();
-        let (lo, hi) = (p[0].min(p[1]).min(p[2]), p[0].max(p[1]).max(p[2]));
-        lo > reach || hi < -reach
-    };
-    let units = [Vec3::x(), Vec3::y(), Vec3::z()];
-    if units.iter().any(apart) {
-        return false;
+/// Directions of the rays that vote on inside and outside: none of them along an axis, where a part's own faces and edges lie.
+const RAYS: [[f64; 3]; 7] = [
+    [0.5773, 0.5431, 0.6092],
+    [-0.8137, 0.3391, 0.4724],
+    [0.2113, -0.9057, 0.3677],
+    [0.3319, 0.2377, -0.9129],
+    [-0.4513, -0.6171, 0.6447],
+    [-0.6689, 0.6143, -0.4187],
+    [0.7411, -0.4337, -0.5129],
+];
+
+/// Where the line `p + s d` crosses a triangle: `s`, and the determinant, negative where it goes along the normal.
+fn crossing(p: &Vec3, d: &Vec3, [a, b, c]: &[Vec3; 3]) -> Option<(f64, f64)> {
+    let (e1, e2) = (b - a, c - a);
+    let h = d.cross(&e2);
+    let det = e1.dot(&h);
+    // Relative to the lengths that enter it: a small triangle of a fine scan is no line.
+    if det.abs() < 1e-12 * e1.norm() * e2.norm() * d.norm() {
+        return None;
     }
-    let edges = [t[1] - t[0], t[2] - t[1], t[0] - t[2]];
-    if apart(&edges[0].cross(&edges[1])) {
-        return false;
+    let s = p - a;
+    let u = s.dot(&h) / det;
+    let w = s.cross(&e1);
+    let v = d.dot(&w) / det;
+    (u >= 0.0 && v >= 0.0 && u + v <= 1.0).then(|| (e2.dot(&w) / det, det))
+}
+
+/// A box drawn out along a line: all points `centre + sum of k_i half_i` with `k_i` from -1 to 1.
+struct Zonotope {
+    centre: Vec3,
+    half: [Vec3; 4],
+    /// Normals of its faces.
+    axes: Vec<Vec3>,
+}
+
+impl Zonotope {
+    fn find_axes(&mut self) {
+        for (i, a) in self.half.iter().enumerate() {
+            for b in self.half.iter().skip(i + 1) {
+                // Sides along each other span no face.
+                self.axes.extend(a.cross(b).try_normalize(1e-18));
+            }
+        }
     }
-    !units.iter().any(|u| edges.iter().any(|e| apart(&u.cross(e))))
+
+    fn reach(&self, axis: &Vec3) -> f64 {
+        self.half.iter().map(|h| h.dot(axis).abs()).sum()
+    }
+
+    /// Whether one of its faces separates it from an axis-parallel box; a hint, which may say "meets" too often.
+    fn meets_box(&self, centre: &Vec3, half: &Vec3) -> bool {
+        let d = centre - self.centre;
+        self.axes.iter().all(|a| d.dot(a).abs() <= self.reach(a) + half.dot(&a.abs()))
+    }
+
+    /// Separating axes of two convex bodies: they touch when none of their faces' normals and of the products of their edges separates them.
+    fn touches(&self, t: &[Vec3; 3]) -> bool {
+        let t = t.map(|v| v - self.centre);
+        let apart = |axis: &Vec3| {
+            let p = t.map(|v| v.dot(axis));
+            let reach = self.reach(axis);
+            let (lo, hi) = (p[0].min(p[1]).min(p[2]), p[0].max(p[1]).max(p[2]));
+            lo > reach || hi < -reach
+        };
+        let edges = [t[1] - t[0], t[2] - t[1], t[0] - t[2]];
+        !(self.axes.iter().any(apart)
+            || apart(&edges[0].cross(&edges[1]))
+            || self.half.iter().any(|h| edges.iter().any(|e| apart(&h.cross(e)))))
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use graspd_rt::geom::Pose;
+    use nalgebra::Point3;
     use rand::{RngExt, SeedableRng};
+
+    /// Whether a triangle reaches into a box, by cutting it off at the box's six sides.
+    fn clip(b: &OrientedBox, t: &[Vec3; 3]) -> bool {
+        let inverse = b.frame_from_box.inverse();
+        let mut p: Vec<Vec3> = t.iter().map(|v| (inverse * Point3::from(*v)).coords).collect();
+        for (k, s) in (0..3).flat_map(|k| [(k, 1.0), (k, -1.0)]) {
+            let over = |v: &Vec3| s * v[k] - b.half[k];
+            let mut q = Vec::new();
+            for (i, v) in p.iter().enumerate() {
+                let w = p[(i + 1) % p.len()];
+                if over(v) <= 0.0 {
+                    q.push(*v);
+                }
+                if over(v) * over(&w) < 0.0 {
+                    q.push(v.lerp(&w, over(v) / (over(v) - over(&w))));
+                }
+            }
+            p = q;
+        }
+        !p.is_empty()
+    }
 
     #[test]
     fn the_tree_answers_as_a_plain_search_does() {
@@ -183,12 +325,20 @@ mod tests {
         for k in 0..300 {
             let pose = Pose::new(v(1.0), v(3.0));
             let b = OrientedBox { frame_from_box: pose, half: v(0.15).abs() + Vec3::repeat(0.01) };
-            let inverse = b.frame_from_box.inverse();
-            let plain = (0..mesh.triangles.len()).any(|t| {
-                let local = mesh.corners(t).map(|p| (inverse * Point3::from(p)).coords);
-                box_touches_triangle(&b.half, &local)
-            });
+            let plain = (0..mesh.triangles.len()).any(|t| clip(&b, &mesh.corners(t)));
             assert_eq!(tree.touches(&b), plain, "{k}");
+            // A sweep touches what any of many boxes on the way touches, and only a little more than they do.
+            let way = v(0.3);
+            let boxes = |n: usize, grow: f64| {
+                (0..=n).any(|i| {
+                    let on = OrientedBox { half: b.half + Vec3::repeat(grow), ..b }
+                        .moved(&Pose::from(way * (i as f64 / n as f64)));
+                    tree.touches(&on)
+                })
+            };
+            let swept = tree.touches_sweep(&b, &way);
+            assert!(swept || !boxes(60, 0.0), "{k}");
+            assert!(!swept || boxes(60, 5e-3), "{k}");
             touched += i32::from(plain);
             let (p, q) = (v(1.2), v(1.2));
             let plain = (0..mesh.triangles.len()).any(|t| {
@@ -205,8 +355,12 @@ mod tests {
     fn a_box_that_holds_a_triangle_or_is_pierced_by_one_touches_it() {
         let big = [Vec3::new(-9.0, -9.0, 0.1), Vec3::new(9.0, -9.0, 0.1), Vec3::new(0.0, 9.0, 0.1)];
         let half = Vec3::new(1.0, 1.0, 0.2);
-        assert!(box_touches_triangle(&half, &big));
-        assert!(!box_touches_triangle(&half, &big.map(|v| v + Vec3::z() * 0.2)));
-        assert!(box_touches_triangle(&half, &big.map(|v| v * 1e-3)));
+        let touches = |t: [Vec3; 3]| {
+            let mesh = Mesh { vertices: t.to_vec(), triangles: vec![[0, 1, 2]] };
+            Bvh::new(&mesh).touches(&OrientedBox { frame_from_box: Pose::identity(), half })
+        };
+        assert!(touches(big));
+        assert!(!touches(big.map(|v| v + Vec3::z() * 0.2)));
+        assert!(touches(big.map(|v| v * 1e-3)));
     }
 }

@@ -1,14 +1,18 @@
 //! The flat faces of a mesh: regions of triangles in nearly one plane, whether a CAD part's exact ones or a scan's noisy ones.
 
+use super::bvh::Bvh;
+use super::links::Links;
 use super::mesh::Mesh;
+use super::smooth::{crumpled, noise, relaxed, smoothed};
 use graspd_rt::geom::Vec3;
+use std::collections::VecDeque;
 
 /// What counts as flat.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Flatness {
     /// Largest angle of a triangle against its face, radians.
     pub angle: f64,
-    /// Largest distance from the face's plane, metres.
+    /// Largest distance from the face's plane, metres. A scan whose noise is larger gets more.
     pub distance: f64,
     /// Smallest area of a face, square metres.
     pub area: f64,
@@ -29,150 +33,315 @@ pub struct Face {
     pub centre: Vec3,
     /// Area, square metres.
     pub area: f64,
-    /// Its triangles.
+    /// Its triangles, ascending.
     pub triangles: Vec<u32>,
 }
 
-/// Finds the faces of a mesh, the largest first.
-pub fn faces(mesh: &Mesh, flat: &Flatness) -> Vec<Face> {
-    let n = mesh.triangles.len();
-    let neighbours = neighbours(mesh);
-    let mut normal = Vec::with_capacity(n);
-    let mut area = Vec::with_capacity(n);
-    let mut centre = Vec::with_capacity(n);
-    for t in 0..n {
-        let [a, b, c] = mesh.corners(t);
-        let x = (b - a).cross(&(c - a));
-        normal.push(x / x.norm().max(1e-300));
-        area.push(0.5 * x.norm());
-        centre.push((a + b + c) / 3.0);
+/// Two faces whose planes differ by less than this are one that was found in two pieces: 3 degrees.
+const SAME_PLANE: f64 = 0.9986;
+/// A triangle beside a face belongs to it when it lies in its plane and faces its side: cosine of 50 degrees, for the crumples of a scan.
+const SAME_SIDE: f64 = 0.643;
+/// The angle within which two faces are partners already: 6 degrees, as for a handle.
+const PARTNER: f64 = 0.9945;
+/// A region may not reach further from its plane than this, however noisy, metres.
+const MOST_DISTANCE: f64 = 1e-3;
+
+/// Triangles with all that growing asks for.
+struct Ground {
+    links: Links,
+    /// Normals with the scan's noise taken out.
+    normal: Vec<Vec3>,
+    /// Half the cross product of two sides: area times the triangle's own normal.
+    vector: Vec<Vec3>,
+    centre: Vec<Vec3>,
+    /// Needles, whose own normal is only rounding error.
+    needle: Vec<bool>,
+    /// Whether noise is larger than the mesh's creases: a scan.
+    crumpled: bool,
+    distance: f64,
+    cos: f64,
+}
+
+fn get<T: Copy + Default>(v: &[T], t: u32) -> T {
+    v.get(t as usize).copied().unwrap_or_default()
+}
+
+/// Finds the faces of a mesh, the largest first. `tree` is of the same mesh.
+pub fn faces(mesh: &Mesh, tree: &Bvh<'_>, flat: &Flatness) -> Vec<Face> {
+    let g = Ground::new(mesh, tree, flat);
+    let n = mesh.triangles.len() as u32;
+    // The face of each triangle, counted from 1.
+    let mut owner = vec![0u32; n as usize];
+    let mut regions: Vec<Vec<u32>> = Vec::new();
+    let mut barren = g.needle.clone();
+    let mut stamp = vec![0u32; n as usize];
+    for (k, seed) in g.seeds().into_iter().enumerate() {
+        if get(&owner, seed) != 0 || get(&barren, seed) {
+            continue;
+        }
+        let grown = g.grow(seed, &owner, &mut stamp, k as u32 + 1);
+        let area: f64 = grown.iter().map(|t| get(&g.vector, *t).norm()).sum();
+        if area >= flat.area {
+            regions.push(Vec::new());
+            own(&mut owner, &grown, regions.len() as u32);
+            continue;
+        }
+        // Small regions stay free: a larger one, seeded later, may reach them. Seeds beside this one would only find the same again.
+        let from = get(&g.centre, seed);
+        let near = 0.09 * area / std::f64::consts::PI;
+        for t in &grown {
+            if (get(&g.centre, *t) - from).norm_squared() <= near {
+                if let Some(b) = barren.get_mut(*t as usize) {
+                    *b = true;
+                }
+            }
+        }
     }
-    // A scan's triangles are smaller than its noise; neighbours across no crease are averaged before they are compared.
-    let raw = normal.clone();
-    for _ in 0..2 {
-        let before = normal.clone();
-        for (t, m) in normal.iter_mut().enumerate() {
-            let (Some(own), Some(near)) = (before.get(t), neighbours.get(t)) else { continue };
-            let mut sum = *own * area.get(t).copied().unwrap_or(0.0);
-            for k in near.iter().filter(|k| **k != u32::MAX) {
-                if let (Some(o), Some(a)) = (before.get(*k as usize), area.get(*k as usize)) {
-                    if o.dot(own) > 0.85 {
-                        sum += o * *a;
+    for (t, o) in owner.iter().enumerate().filter(|(_, o)| **o > 0) {
+        if let Some(r) = regions.get_mut(*o as usize - 1) {
+            r.push(t as u32);
+        }
+    }
+    let mut found: Vec<Face> = regions.into_iter().filter_map(|r| g.face(r)).collect();
+    found = g.merge(found, &mut owner);
+    if g.crumpled {
+        found = g.complete(mesh, found);
+    }
+    found.sort_by(|a, b| b.area.total_cmp(&a.area));
+    let partners = g.partners(tree, &found, flat);
+    found.extend(partners);
+    found
+}
+
+fn own(owner: &mut [u32], triangles: &[u32], face: u32) {
+    for t in triangles {
+        if let Some(o) = owner.get_mut(*t as usize) {
+            *o = face;
+        }
+    }
+}
+
+impl Ground {
+    fn new(mesh: &Mesh, tree: &Bvh<'_>, flat: &Flatness) -> Self {
+        let n = mesh.triangles.len();
+        let links = Links::new(mesh, tree);
+        let thin = 1e-5 * mesh.size().norm();
+        let measure = |mesh: &Mesh| {
+            let (mut vector, mut centre, mut needle) =
+                (Vec::with_capacity(n), Vec::with_capacity(n), Vec::with_capacity(n));
+            for t in 0..n {
+                let [a, b, c] = mesh.corners(t);
+                let x = (b - a).cross(&(c - a)) * 0.5;
+                let longest = (b - a).norm().max((c - b).norm()).max((a - c).norm());
+                vector.push(x);
+                centre.push((a + b + c) / 3.0);
+                needle.push(2.0 * x.norm() < thin * longest);
+            }
+            (vector, centre, needle)
+        };
+        let noise = noise(mesh);
+        let (mut vector, mut centre, needle) = measure(mesh);
+        let crumpled = crumpled(&links, &vector, &needle);
+        if crumpled {
+            (vector, centre, _) = measure(&relaxed(mesh, noise));
+        }
+        let normal = smoothed(&links, &vector, &needle, crumpled);
+        let distance = flat.distance.max((3.5 * noise).min(MOST_DISTANCE));
+        Self { links, normal, vector, centre, needle, crumpled, distance, cos: flat.angle.cos() }
+    }
+
+    /// Where to begin: in flat surroundings, because a seed on a rounded edge would take a slice off two faces; large triangles before small.
+    fn seeds(&self) -> Vec<u32> {
+        let n = self.normal.len() as u32;
+        let rough = |t: u32| {
+            let own = get(&self.normal, t);
+            let worst = self.links.of(t).iter().map(|k| 1.0 - get(&self.normal, *k).dot(&own)).fold(0.0, f64::max);
+            (worst * 2e3).floor().min(4e3) as u32
+        };
+        let mut seeds: Vec<(u32, f64, u32)> =
+            (0..n).filter(|t| !get(&self.needle, *t)).map(|t| (rough(t), -get(&self.vector, t).norm(), t)).collect();
+        seeds.sort_unstable_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2)));
+        seeds.into_iter().map(|s| s.2).collect()
+    }
+
+    fn grow(&self, seed: u32, owner: &[u32], stamp: &mut [u32], mark: u32) -> Vec<u32> {
+        self.spread(seed, owner, stamp, mark, None)
+    }
+
+    /// The region round a seed, in the plane of a given normal or, without one, in the plane that it turns out to have.
+    fn spread(&self, seed: u32, owner: &[u32], stamp: &mut [u32], mark: u32, fixed: Option<Vec3>) -> Vec<u32> {
+        let (mut plane_n, mut plane_c) = (fixed.unwrap_or(get(&self.normal, seed)), get(&self.centre, seed));
+        let (mut sum_n, mut sum_c, mut sum_a) = (Vec3::zeros(), Vec3::zeros(), 0.0);
+        let mut queue = VecDeque::from([seed]);
+        let mut out = Vec::new();
+        if let Some(s) = stamp.get_mut(seed as usize) {
+            *s = mark;
+        }
+        while let Some(t) = queue.pop_front() {
+            out.push(t);
+            let a = get(&self.vector, t).norm();
+            sum_n += get(&self.normal, t) * a;
+            sum_c += get(&self.centre, t) * a;
+            sum_a += a;
+            // The plane follows the region while it is young, then stands: a slowly turning surface must not lead it round.
+            if fixed.is_none() && out.len().is_power_of_two() && out.len() <= 4096 {
+                if let Some(n) = sum_n.try_normalize(1e-300) {
+                    plane_n = n;
+                    plane_c = sum_c / sum_a;
+                }
+            }
+            for k in self.links.of(t) {
+                let free = stamp.get(*k as usize).is_some_and(|s| *s != mark) && get(owner, *k) == 0;
+                let off = (get(&self.centre, *k) - plane_c).dot(&plane_n).abs();
+                let fits = if get(&self.needle, *k) {
+                    off <= 0.1 * self.distance
+                } else {
+                    off <= self.distance && get(&self.normal, *k).dot(&plane_n) >= self.cos
+                };
+                if free && fits {
+                    if let Some(s) = stamp.get_mut(*k as usize) {
+                        *s = mark;
+                    }
+                    queue.push_back(*k);
+                }
+            }
+        }
+        out
+    }
+
+    /// The face that triangles make up. The sum of their area vectors depends only on their common outline, so that a scan's noise cancels.
+    fn face(&self, mut triangles: Vec<u32>) -> Option<Face> {
+        triangles.sort_unstable();
+        let (mut sum_n, mut sum_c, mut sum_a) = (Vec3::zeros(), Vec3::zeros(), 0.0);
+        for t in &triangles {
+            let v = get(&self.vector, *t);
+            sum_n += v;
+            sum_c += get(&self.centre, *t) * v.norm();
+            sum_a += v.norm();
+        }
+        let normal = sum_n.try_normalize(1e-300)?;
+        Some(Face { normal, centre: sum_c / sum_a, area: sum_a, triangles })
+    }
+
+    /// Makes one of neighbours that lie in one plane: a face may be found in pieces where it is crumpled or cut by needles.
+    fn merge(&self, found: Vec<Face>, owner: &mut [u32]) -> Vec<Face> {
+        for (k, f) in found.iter().enumerate() {
+            own(owner, &f.triangles, k as u32 + 1);
+        }
+        let mut root: Vec<usize> = (0..found.len()).collect();
+        let top = |root: &[usize], mut k: usize| {
+            while let Some(up) = root.get(k).copied().filter(|up| *up != k) {
+                k = up;
+            }
+            k
+        };
+        for (k, f) in found.iter().enumerate() {
+            let mut beside: Vec<usize> = f
+                .triangles
+                .iter()
+                .flat_map(|t| self.links.of(*t))
+                .map(|t| get(owner, *t) as usize)
+                .filter(|o| *o > k + 1)
+                .map(|o| o - 1)
+                .collect();
+            beside.sort_unstable();
+            beside.dedup();
+            for other in beside {
+                let Some(g) = found.get(other) else { continue };
+                let d = g.centre - f.centre;
+                let off = d.dot(&f.normal).abs().max(d.dot(&g.normal).abs());
+                if f.normal.dot(&g.normal) >= SAME_PLANE && off <= self.distance {
+                    let (a, b) = (top(&root, k), top(&root, other));
+                    if let Some(r) = root.get_mut(a.max(b)) {
+                        *r = a.min(b);
                     }
                 }
             }
-            *m = sum.try_normalize(0.0).unwrap_or(*own);
         }
-    }
-    let mut seeds: Vec<u32> = (0..n as u32).collect();
-    // Flat surroundings first: a seed on a rounded edge would take a slice off two faces.
-    let roughness = |t: u32| {
-        let own = normal.get(t as usize).copied().unwrap_or_default();
-        let near = neighbours.get(t as usize).copied().unwrap_or([u32::MAX; 3]);
-        near.iter().filter_map(|k| normal.get(*k as usize)).map(|o| 1.0 - o.dot(&own)).fold(0.0, f64::max)
-    };
-    let rough: Vec<f64> = seeds.iter().map(|t| (roughness(*t) * 2e3).floor()).collect();
-    seeds.sort_by(|a, b| {
-        let r = |t: &u32| rough.get(*t as usize).copied().unwrap_or(0.0);
-        let s = |t: &u32| area.get(*t as usize).copied().unwrap_or(0.0);
-        r(a).total_cmp(&r(b)).then(s(b).total_cmp(&s(a))).then(a.cmp(b))
-    });
-    let cos = flat.angle.cos();
-    let mut taken = vec![false; n];
-    let mut out = Vec::new();
-    for seed in seeds {
-        if taken.get(seed as usize).copied().unwrap_or(true) {
-            continue;
-        }
-        let grown = grow(seed, &neighbours, &normal, &centre, &area, &taken, cos, flat.distance);
-        let (mut sum_n, mut sum_c, mut sum_a) = (Vec3::zeros(), Vec3::zeros(), 0.0);
-        for t in &grown {
-            let (Some(m), Some(c), Some(a)) = (raw.get(*t as usize), centre.get(*t as usize), area.get(*t as usize))
-            else {
-                continue;
-            };
-            sum_n += m * *a;
-            sum_c += c * *a;
-            sum_a += a;
-        }
-        // Small regions stay free: a larger one, seeded later, may reach them.
-        let keep = sum_a >= flat.area;
-        for t in grown.iter().filter(|t| keep || **t == seed) {
-            if let Some(x) = taken.get_mut(*t as usize) {
-                *x = true;
+        let mut groups: Vec<Vec<u32>> = vec![Vec::new(); found.len()];
+        for (k, f) in found.into_iter().enumerate() {
+            if let Some(g) = groups.get_mut(top(&root, k)) {
+                g.extend(f.triangles);
             }
         }
-        if let (true, Some(normal)) = (keep, sum_n.try_normalize(1e-300)) {
-            out.push(Face { normal, centre: sum_c / sum_a, area: sum_a, triangles: grown });
-        }
+        groups.into_iter().filter(|g| !g.is_empty()).filter_map(|g| self.face(g)).collect()
     }
-    out.sort_by(|a, b| b.area.total_cmp(&a.area));
-    out
-}
 
-#[allow(clippy::too_many_arguments)]
-fn grow(
-    seed: u32,
-    neighbours: &[[u32; 3]],
-    normal: &[Vec3],
-    centre: &[Vec3],
-    area: &[f64],
-    taken: &[bool],
-    cos: f64,
-    distance: f64,
-) -> Vec<u32> {
-    let get = |v: &[Vec3], t: u32| v.get(t as usize).copied().unwrap_or_default();
-    let (mut plane_n, mut plane_c) = (get(normal, seed), get(centre, seed));
-    let (mut sum_n, mut sum_c, mut sum_a) = (Vec3::zeros(), Vec3::zeros(), 0.0);
-    let mut inside = std::collections::HashSet::from([seed]);
-    let mut queue = std::collections::VecDeque::from([seed]);
-    let mut out = Vec::new();
-    while let Some(t) = queue.pop_front() {
-        out.push(t);
-        let a = area.get(t as usize).copied().unwrap_or(0.0);
-        sum_n += get(normal, t) * a;
-        sum_c += get(centre, t) * a;
-        sum_a += a;
-        // The plane follows the region while it is young, then stands: a slowly turning surface must not lead it round.
-        if out.len().is_power_of_two() && out.len() <= 4096 {
-            if let Some(n) = sum_n.try_normalize(1e-300) {
-                plane_n = n;
-                plane_c = sum_c / sum_a;
+    /// Round walls are cut into strips where growing happened to begin, on one side not where on the other. For each strip whose opposite is not
+    /// its partner already, the strip that is.
+    fn partners(&self, tree: &Bvh<'_>, found: &[Face], flat: &Flatness) -> Vec<Face> {
+        let mut out: Vec<Face> = Vec::new();
+        let mut stamp = vec![0u32; self.normal.len()];
+        let none = stamp.clone();
+        let mut mark = 0;
+        let opposed = |f: &Face, n: &Vec3| f.normal.dot(n) <= -PARTNER;
+        for f in found {
+            // The triangle nearest to the middle: the middle itself may be in the air.
+            let off = |t: &u32| (get(&self.centre, *t) - f.centre).norm_squared();
+            let Some(middle) = f.triangles.iter().min_by(|a, b| off(a).total_cmp(&off(b))) else { continue };
+            let hits = tree.pierced(&get(&self.centre, *middle), &-f.normal);
+            for hit in hits.into_iter().filter(|t| t != middle && get(&self.normal, *t).dot(&f.normal) <= -self.cos) {
+                // It is found when the strip holds the triangle hit, or stands beside it.
+                let known = |g: &Face| {
+                    let d = get(&self.centre, hit) - g.centre;
+                    let beside = d.dot(&g.normal).abs() <= self.distance && d.norm_squared() <= g.area;
+                    opposed(f, &g.normal) && (beside || g.triangles.binary_search(&hit).is_ok())
+                };
+                if found.iter().chain(&out).any(known) {
+                    continue;
+                }
+                mark += 1;
+                let grown = self.spread(hit, &none, &mut stamp, mark, Some(-f.normal));
+                if let Some(g) = self.face(grown).filter(|g| g.area >= flat.area && opposed(f, &g.normal)) {
+                    out.push(g);
+                }
             }
         }
-        for k in neighbours.get(t as usize).into_iter().flatten() {
-            if *k == u32::MAX || inside.contains(k) || taken.get(*k as usize).copied().unwrap_or(true) {
+        out
+    }
+
+    /// Gives to a scan's faces every triangle that lies in their plane and holds together with them, however it is turned: near an edge and in a
+    /// crumple the normals say little. A triangle may so belong to two faces that meet. Faces that come out again are left out.
+    fn complete(&self, mesh: &Mesh, mut found: Vec<Face>) -> Vec<Face> {
+        found.sort_by(|a, b| b.area.total_cmp(&a.area));
+        let n = mesh.triangles.len();
+        // The last face that reached each triangle, counted from 1, and the one of them that holds it for its own.
+        let (mut reached, mut held) = (vec![0u32; n], vec![0u32; n]);
+        let mut out: Vec<Face> = Vec::new();
+        for f in found {
+            let again = f.triangles.iter().filter(|t| {
+                let by = (get(&held, **t) as usize).checked_sub(1).and_then(|k| out.get(k));
+                by.is_some_and(|o: &Face| o.normal.dot(&f.normal) > self.cos)
+            });
+            if 2 * again.count() > f.triangles.len() {
                 continue;
             }
-            if get(normal, *k).dot(&plane_n) >= cos && (get(centre, *k) - plane_c).dot(&plane_n).abs() <= distance {
-                inside.insert(*k);
-                queue.push_back(*k);
+            // The plane by the scan itself, not by its relaxed shape.
+            let mark = out.len() as u32 + 1;
+            let corners = |t: u32| mesh.corners(t as usize);
+            let count = (3 * f.triangles.len().max(1)) as f64;
+            let centre = f.triangles.iter().flat_map(|t| corners(*t)).sum::<Vec3>() / count;
+            let flat = |t: u32| corners(t).iter().all(|p| (p - centre).dot(&f.normal).abs() <= self.distance);
+            let mut queue = f.triangles.clone();
+            own(&mut reached, &queue, mark);
+            own(&mut held, &queue, mark);
+            let mut next = 0;
+            while let Some(t) = queue.get(next).copied() {
+                next += 1;
+                for k in self.links.of(t) {
+                    if get(&reached, *k) != mark && flat(*k) {
+                        own(&mut reached, &[*k], mark);
+                        if get(&self.normal, *k).dot(&f.normal) > SAME_SIDE {
+                            own(&mut held, &[*k], mark);
+                        }
+                        queue.push(*k);
+                    }
+                }
             }
+            queue.sort_unstable();
+            let area = queue.iter().map(|t| get(&self.vector, *t).dot(&f.normal).max(0.0)).sum();
+            out.push(Face { normal: f.normal, centre, area, triangles: queue });
         }
+        out
     }
-    out.sort_unstable();
-    out
-}
-
-/// The triangle across each edge; `u32::MAX` where there is none or more than one.
-fn neighbours(mesh: &Mesh) -> Vec<[u32; 3]> {
-    let mut edges: Vec<(u32, u32, u32, u8)> = Vec::with_capacity(3 * mesh.triangles.len());
-    for (t, [a, b, c]) in mesh.triangles.iter().enumerate() {
-        for (side, (p, q)) in [(*a, *b), (*b, *c), (*c, *a)].into_iter().enumerate() {
-            edges.push((p.min(q), p.max(q), t as u32, side as u8));
-        }
-    }
-    edges.sort_unstable();
-    let mut out = vec![[u32::MAX; 3]; mesh.triangles.len()];
-    for group in edges.chunk_by(|x, y| (x.0, x.1) == (y.0, y.1)) {
-        if let [(_, _, t, i), (_, _, u, j)] = group {
-            if let Some(s) = out.get_mut(*t as usize).and_then(|s| s.get_mut(*i as usize)) {
-                *s = *u;
-            }
-            if let Some(s) = out.get_mut(*u as usize).and_then(|s| s.get_mut(*j as usize)) {
-                *s = *t;
-            }
-        }
-    }
-    out
 }

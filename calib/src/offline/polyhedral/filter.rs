@@ -2,12 +2,13 @@
 
 use super::bvh::Bvh;
 use super::handles::{BoxHandle, Handles, Overlap};
+use super::place::{Claw, Place, Setting};
 use super::reach::Arm;
-use crate::files::{GripperFile, OrientedBox};
+use crate::files::GripperFile;
 use crate::offline::handle::grasp::LEAST_MARKS;
 use crate::offline::handle::setpoint::{Obstacle, Scene};
 use graspd_rt::geom::{Pose, Rig, Vec3};
-use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion};
+use nalgebra::Point3;
 
 /// What the situation allows.
 pub struct Situation<'a> {
@@ -59,9 +60,9 @@ pub enum Reason {
         least_mm2: f64,
     },
     /// The gripper would hit the part.
-    #[error("the {what} would hit the part on the way in")]
+    #[error("the {what} would hit the part")]
     Collides {
-        /// "fingers" or "body".
+        /// "fingers", "body", or "closing fingers": they would meet something else before both faces.
         what: &'static str,
     },
     /// Too few marks are seen.
@@ -142,24 +143,9 @@ impl Obstacle for MeshObstacle<'_> {
     }
 }
 
-/// What of a gripper matters to a claw's contact.
-struct Claw {
-    /// Half width across the approach, metres.
-    half_width: f64,
-    /// How far the tip stands beyond the gripper's origin, metres.
-    tip: f64,
-    /// Length of the finger in front of the palm.
-    length: f64,
-}
-
 /// Judges every handle; the kept ones come first, the best of them at the top.
 pub fn judge(handles: &Handles, tree: &Bvh<'_>, gripper: &GripperFile, s: &Situation<'_>) -> Vec<Judged> {
-    let claw =
-        gripper.fingers.first().map_or(Claw { half_width: 5e-3, tip: 0.0, length: gripper.finger_length }, |f| Claw {
-            half_width: f.closed.half.y,
-            tip: f.closed.frame_from_box.translation.z + f.closed.half.z,
-            length: gripper.finger_length,
-        });
+    let claw = Claw::of(gripper);
     let mut out: Vec<Judged> = handles
         .handles
         .iter()
@@ -174,166 +160,88 @@ pub fn judge(handles: &Handles, tree: &Bvh<'_>, gripper: &GripperFile, s: &Situa
     out
 }
 
+/// Places of one handle at which turn, reach and visibility are asked for at most: near ones answer alike.
+const MOST_PLACES: usize = 8;
+
 fn one(h: &BoxHandle, o: &Overlap, tree: &Bvh<'_>, gripper: &GripperFile, claw: &Claw, s: &Situation<'_>) -> Judged {
-    let y = h.approach.cross(&h.closing);
-    let axes = Matrix3::from_columns(&[h.closing, y, h.approach]);
-    let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
-    let pose_at = |side: f64, depth: f64| Pose::from_parts((o.origin + y * side + h.approach * depth).into(), rotation);
-    let opening = h.width + 2.0 * s.clearance;
+    let setting = Setting::new(h, o, tree, gripper, claw, s);
     let mut judged = Judged {
         handle: h.clone(),
-        mesh_from_gripper: pose_at(0.0, 0.0),
-        opening,
+        mesh_from_gripper: setting.middle(),
+        opening: h.width + 2.0 * s.clearance,
         contact: 0.0,
         visibility: [0.0; 2],
         seen: [0; 2],
         turn: 0.0,
         reason: None,
     };
-    let [min, max] = gripper.opening;
-    if opening > max {
-        judged.reason = Some(Reason::TooWide { width_mm: opening * 1e3, max_mm: max * 1e3 });
-        return judged;
-    }
-    if h.width < min {
-        judged.reason = Some(Reason::TooThin { width_mm: h.width * 1e3, min_mm: min * 1e3 });
-        return judged;
-    }
-    let cells: Vec<[f64; 2]> = o.along(&y).zip(o.along(&h.approach)).map(|(a, b)| [a, b]).collect();
-    let places = places(&cells, o.cell, claw);
-    let mut best_contact = 0.0f64;
-    let mut hit = None;
-    for p in &places {
-        best_contact = best_contact.max(p.contact);
-        if p.contact < s.contact {
-            continue;
+    let mut looked = Vec::<Vec3>::new();
+    let mut first: Option<Judged> = None;
+    let apart = 0.1 * (o.cells.len() as f64).sqrt() * o.cell;
+    let found = setting.find(&mut |places| {
+        let Some(at) = places.first().map(|p| p.pose.translation.vector) else { return false };
+        if looked.iter().any(|l| (l - at).norm() < apart) {
+            return false;
         }
-        let pose = pose_at(p.side, p.tip - claw.tip);
-        match collision(tree, gripper, opening, &pose, s) {
-            Some(what) => hit = hit.or(Some((what, pose, p.contact))),
-            None => {
-                judged.contact = p.contact;
-                judged.mesh_from_gripper = pose;
-                see_and_reach(&mut judged, tree, gripper, s);
-                return judged;
-            }
+        looked.push(at);
+        let j = see_and_reach(&judged, places, tree, gripper, s);
+        if j.reason.is_none() {
+            first = Some(j);
+            return true;
         }
-    }
-    judged.reason = Some(match hit {
-        Some((what, pose, contact)) => {
-            judged.mesh_from_gripper = pose;
-            judged.contact = contact;
-            Reason::Collides { what }
-        }
-        None => Reason::Contact { contact_mm2: best_contact * 1e6, least_mm2: s.contact * 1e6 },
+        // What is told is the reason at the best hold.
+        first.get_or_insert(j);
+        looked.len() >= MOST_PLACES
     });
+    match (found, first) {
+        (_, Some(j)) => return j,
+        (Err((reason, contact, pose)), None) => {
+            judged.reason = Some(reason);
+            judged.contact = contact;
+            judged.mesh_from_gripper = pose;
+        }
+        // Places are only passed over for being near one that was looked at.
+        (Ok(()), None) => judged.reason = Some(Reason::Reach),
+    }
     judged
 }
 
-/// A place for the claws on an overlap: across the approach, and how deep the tips go.
-struct Place {
-    side: f64,
-    tip: f64,
-    contact: f64,
-}
-
-/// Places to try, the best hold first: in the middle before at the sides, deep before shallow.
-fn places(cells: &[[f64; 2]], cell: f64, claw: &Claw) -> Vec<Place> {
-    let n = cells.len().max(1) as f64;
-    let middle = cells.iter().map(|c| c[0]).sum::<f64>() / n;
-    let (lo, hi) = cells.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), c| (a.min(c[0]), b.max(c[0])));
-    // Half a claw apart, so that no room as wide as a claw and a half is stepped over.
-    let steps = ((hi - lo) / (0.5 * claw.half_width).max(cell)).ceil().clamp(8.0, 80.0);
-    let mut sides = vec![middle];
-    for k in 0..=steps as usize {
-        sides.push(lo + (hi - lo) * k as f64 / steps);
-    }
-    sides.sort_by(|a, b| (a - middle).abs().total_cmp(&(b - middle).abs()));
-    let mut out = Vec::new();
-    for side in sides {
-        let strip: Vec<f64> =
-            cells.iter().filter(|c| (c[0] - side).abs() <= claw.half_width.max(cell)).map(|c| c[1]).collect();
-        let (near, far) = strip.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), z| (a.min(*z), b.max(*z)));
-        if near > far {
-            continue;
-        }
-        let (near, far) = (near - 0.5 * cell, far + 0.5 * cell);
-        for part in [1.0, 0.75, 0.5, 0.3] {
-            // The palm must not touch: the part may stand no further in than the fingers are long, less a millimetre.
-            let tip = near + (part * (far - near)).min(claw.length - 1e-3);
-            let contact = strip.iter().filter(|z| **z <= tip).count() as f64 * cell * cell;
-            out.push(Place { side, tip, contact });
-        }
-    }
-    out
-}
-
-/// What of the gripper hits the mesh, or comes closer to it than half the clearance, at a pose or on the straight way to it.
-fn collision(
-    tree: &Bvh<'_>,
-    gripper: &GripperFile,
-    opening: f64,
-    pose: &Pose,
-    s: &Situation<'_>,
-) -> Option<&'static str> {
-    let fingers = gripper.fingers.len();
-    let way = s.approach_length;
-    let air = Vec3::repeat((0.5 * s.clearance).clamp(1e-6, 0.5e-3));
-    for (k, b) in gripper.boxes(opening).iter().enumerate() {
-        let b = OrientedBox { half: b.half + air, ..*b };
-        // The whole sweep of a box along its approach is a longer box, when the box stands along the gripper's axes; else it is sampled.
-        let z = b.frame_from_box.rotation.inverse() * Vec3::z();
-        let hit = if z.z.abs() > 1.0 - 1e-12 {
-            let shift = Pose::translation(0.0, 0.0, -0.5 * way);
-            let long = OrientedBox { frame_from_box: shift * b.frame_from_box, half: b.half + Vec3::z() * (0.5 * way) };
-            tree.touches(&long.moved(pose))
-        } else {
-            let steps = (way / 2e-3).ceil().clamp(1.0, 500.0);
-            (0..=steps as usize).any(|i| {
-                let back = Pose::translation(0.0, 0.0, -way * i as f64 / steps);
-                tree.touches(&b.moved(&(pose * back)))
-            })
-        };
-        if hit {
-            return Some(if k < fingers { "fingers" } else { "body" });
-        }
-    }
-    None
-}
-
-/// Turn, reach and visibility, for the gripper as it is and turned half round: parallel claws do not mind, marks and the arm do.
-fn see_and_reach(j: &mut Judged, tree: &Bvh<'_>, gripper: &GripperFile, s: &Situation<'_>) {
-    let half_turn =
-        Pose::from_parts(Vec3::zeros().into(), UnitQuaternion::from_axis_angle(&Vec3::z_axis(), std::f64::consts::PI));
+/// Turn, reach and visibility at a place, for the gripper one way round and the other: parallel claws do not mind, marks and the arm do.
+fn see_and_reach(from: &Judged, places: &[Place], tree: &Bvh<'_>, gripper: &GripperFile, s: &Situation<'_>) -> Judged {
+    let mut j = from.clone();
     let back = Pose::translation(0.0, 0.0, -s.approach_length);
-    // Collisions were judged with the gripper one way round; a lopsided body may hit the other way.
-    let mut poses = vec![j.mesh_from_gripper];
-    let other = j.mesh_from_gripper * half_turn;
-    if collision(tree, gripper, j.opening, &other, s).is_none() {
-        poses.push(other);
+    let turn = |p: &Place| s.present.map_or(0.0, |now| now.rotation.angle_to(&(s.left_from_mesh * p.pose).rotation));
+    let put = |j: &mut Judged, p: &Place| {
+        j.mesh_from_gripper = p.pose;
+        j.opening = p.opening;
+        j.contact = p.contact;
+        j.turn = turn(p);
+    };
+    let mut poses = places.to_vec();
+    if let Some(near) = places.iter().min_by(|a, b| turn(a).total_cmp(&turn(b))) {
+        put(&mut j, near);
     }
-    let turn = |p: &Pose| s.present.map_or(0.0, |now| now.rotation.angle_to(&(s.left_from_mesh * p).rotation));
-    let near = poses.iter().copied().min_by(|a, b| turn(a).total_cmp(&turn(b))).unwrap_or(j.mesh_from_gripper);
-    j.mesh_from_gripper = near;
-    j.turn = turn(&near);
     if let (Some(limit), Some(_)) = (s.max_turn, s.present) {
         poses.retain(|p| turn(p) <= limit);
         if poses.is_empty() {
             j.reason = Some(Reason::Turn { turn_deg: j.turn.to_degrees(), limit_deg: limit.to_degrees() });
-            return;
+            return j;
         }
     }
-    poses.retain(|p| s.reach.is_none_or(|a| a.follows(&(s.left_from_mesh * p * back), &(s.left_from_mesh * p))));
+    poses.retain(|p| {
+        s.reach.is_none_or(|a| a.follows(&(s.left_from_mesh * p.pose * back), &(s.left_from_mesh * p.pose)))
+    });
     if poses.is_empty() {
         j.reason = Some(Reason::Reach);
-        return;
+        return j;
     }
-    let Some(rig) = s.rig else { return };
+    let Some(rig) = s.rig else { return j };
     let obstacle = MeshObstacle { tree, mesh_from_left: s.left_from_mesh.inverse() };
-    let scene = Scene::new(rig, gripper, j.opening, Some(&obstacle));
     let mut best: Option<(bool, f64)> = None;
     let mut most = [0usize; 2];
-    for pose in poses {
+    for place in poses {
+        let scene = Scene::new(rig, gripper, place.opening, Some(&obstacle));
+        let pose = place.pose;
         let at = scene.sights(&(s.left_from_mesh * pose));
         let before = scene.sights(&(s.left_from_mesh * pose * back));
         let mut seen = [0usize; 2];
@@ -347,8 +255,7 @@ fn see_and_reach(j: &mut Judged, tree: &Bvh<'_>, gripper: &GripperFile, s: &Situ
         let top = (worth(0) > 0.0 && worth(1) > 0.0, worth(0).max(worth(1)));
         if top.1 > 0.0 && best.is_none_or(|b| top > b) {
             best = Some(top);
-            j.mesh_from_gripper = pose;
-            j.turn = turn(&pose);
+            put(&mut j, &place);
             j.visibility = [worth(0), worth(1)];
             j.seen = seen;
         }
@@ -357,6 +264,7 @@ fn see_and_reach(j: &mut Judged, tree: &Bvh<'_>, gripper: &GripperFile, s: &Situ
         j.seen = most;
         j.reason = Some(Reason::Hidden { left: most[0], right: most[1] });
     }
+    j
 }
 
 #[cfg(test)]

@@ -3,7 +3,10 @@
 use super::super::faces::{Flatness, faces};
 use super::super::handles::{Opposition, enumerate};
 use super::super::mesh::Mesh;
+use super::super::place::collision;
 use super::*;
+use crate::files::OrientedBox;
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 
 /// A box from its lower and upper corner.
 fn block(lo: [f64; 3], hi: [f64; 3]) -> Vec<[Vec3; 3]> {
@@ -65,7 +68,7 @@ fn gripper(max: f64, finger: f64) -> GripperFile {
 fn judged(corners: Vec<[Vec3; 3]>, g: &GripperFile) -> Vec<Judged> {
     let mesh = Mesh::from_corners(corners).unwrap();
     let tree = Bvh::new(&mesh);
-    let found = enumerate(&mesh, &faces(&mesh, &Flatness::default()), &Opposition::default());
+    let found = enumerate(&mesh, &faces(&mesh, &tree, &Flatness::default()), &Opposition::default());
     let s = Situation {
         rig: None,
         left_from_mesh: Pose::identity(),
@@ -163,7 +166,7 @@ fn nothing_missed(found: &Handles, tree: &Bvh<'_>, g: &GripperFile, s: &Situatio
                 }
                 let pose = Pose::from_parts((o.origin + y * at + j.handle.approach * (tip - beyond)).into(), rotation);
                 assert!(
-                    collision(tree, g, j.opening, &pose, s).is_some(),
+                    collision(tree, g, [j.handle.width + 2.0 * s.clearance, j.handle.width], &pose, s).is_some(),
                     "{:?} was dropped ({:?}), but is free at side {at} and tip {tip}",
                     j.handle,
                     j.reason

@@ -4,10 +4,9 @@
 
 use super::faces::Face;
 use super::mesh::Mesh;
+use super::raster::{Grid, rim};
 use graspd_rt::geom::Vec3;
-
-/// Cells along the longer side of the overlap's raster.
-const CELLS: usize = 64;
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 /// What makes two faces a handle.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -24,7 +23,7 @@ impl Default for Opposition {
     }
 }
 
-/// A raster of the part of two faces that stand opposite each other, in the plane between them.
+/// A raster of one connected part of two faces that stand opposite each other, in the plane between them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Overlap {
     /// Origin of the plane's axes, on the middle plane.
@@ -37,6 +36,8 @@ pub struct Overlap {
     pub cell: f64,
     /// Centres of the cells on both faces, in the plane's axes, metres.
     pub cells: Vec<[f64; 2]>,
+    /// For each cell, how far the two faces stand from the middle plane along the closing direction (the second one's is negative), metres.
+    pub heights: Vec<[f64; 2]>,
 }
 
 impl Overlap {
@@ -61,7 +62,7 @@ pub struct BoxHandle {
     pub closing: Vec3,
     /// Direction of the approach, unit.
     pub approach: Vec3,
-    /// Distance between the faces, metres.
+    /// Mean distance between the faces where they stand opposite each other, metres.
     pub width: f64,
     /// Index of the overlap in [`Handles::overlaps`].
     pub overlap: usize,
@@ -80,145 +81,153 @@ pub struct Handles {
 pub fn enumerate(mesh: &Mesh, faces: &[Face], opposition: &Opposition) -> Handles {
     let mut out = Handles { overlaps: Vec::new(), handles: Vec::new() };
     let cos = opposition.angle.cos();
+    let mut rims: Vec<Option<Vec<Vec3>>> = vec![None; faces.len()];
     for (i, a) in faces.iter().enumerate() {
         for (j, b) in faces.iter().enumerate().skip(i + 1) {
             if a.normal.dot(&b.normal) > -cos {
                 continue;
             }
             let Some(closing) = (a.normal - b.normal).try_normalize(1e-9) else { continue };
-            let width = (a.centre - b.centre).dot(&closing);
             // Material between them, not air: a slot's walls look at each other.
-            if width <= 1e-5 {
+            if (a.centre - b.centre).dot(&closing) <= 1e-5 {
                 continue;
             }
-            let Some(overlap) = overlap(mesh, a, b, &closing) else { continue };
-            if overlap.area() < opposition.area {
-                continue;
+            for (k, f) in [(i, a), (j, b)] {
+                if let Some(slot @ None) = rims.get_mut(k) {
+                    *slot = Some(rim(mesh, f));
+                }
             }
-            for approach in ways_in(&overlap) {
-                out.handles.push(BoxHandle { faces: [i, j], closing, approach, width, overlap: out.overlaps.len() });
+            let edges: Vec<Vec3> = [i, j].iter().filter_map(|k| rims.get(*k)?.as_ref()).flatten().copied().collect();
+            for (overlap, ways) in overlaps(mesh, [a, b], &closing, &edges, opposition.area) {
+                let width = overlap.heights.iter().map(|h| h[0] - h[1]).sum::<f64>() / overlap.heights.len() as f64;
+                if width <= 1e-5 {
+                    continue;
+                }
+                for approach in ways {
+                    let index = out.overlaps.len();
+                    out.handles.push(BoxHandle { faces: [i, j], closing, approach, width, overlap: index });
+                }
+                out.overlaps.push(overlap);
             }
-            out.overlaps.push(overlap);
         }
     }
     out
 }
 
-fn overlap(mesh: &Mesh, a: &Face, b: &Face, closing: &Vec3) -> Option<Overlap> {
+/// The parts of two faces that stand opposite each other, each with its ways in.
+fn overlaps(mesh: &Mesh, faces: [&Face; 2], closing: &Vec3, edges: &[Vec3], least: f64) -> Vec<(Overlap, Vec<Vec3>)> {
     let side = if closing.x.abs() < 0.9 { Vec3::x() } else { Vec3::y() };
     let u = closing.cross(&side).normalize();
     let v = closing.cross(&u);
-    let origin = (a.centre + b.centre) * 0.5;
-    let bounds = |f: &Face| {
-        let (mut lo, mut hi) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
-        for p in f.triangles.iter().flat_map(|t| mesh.corners(*t as usize)) {
-            for (k, x) in [(p - origin).dot(&u), (p - origin).dot(&v)].into_iter().enumerate() {
-                lo[k] = lo[k].min(x);
-                hi[k] = hi[k].max(x);
-            }
-        }
-        (lo, hi)
-    };
-    let ((la, ha), (lb, hb)) = (bounds(a), bounds(b));
-    let lo = [la[0].max(lb[0]), la[1].max(lb[1])];
-    let hi = [ha[0].min(hb[0]), ha[1].min(hb[1])];
-    let size = [hi[0] - lo[0], hi[1] - lo[1]];
-    if !(size[0] > 1e-5 && size[1] > 1e-5) {
-        return None;
-    }
-    let cell = size[0].max(size[1]) / CELLS as f64;
-    let n = size.map(|s| ((s / cell).ceil() as usize).clamp(1, CELLS));
-    let raster = |f: &Face| {
-        let mut on = vec![false; n[0] * n[1]];
-        for t in &f.triangles {
-            let p = mesh.corners(*t as usize).map(|p| [(p - origin).dot(&u), (p - origin).dot(&v)]);
-            let index = |x: f64, k: usize| ((x - lo[k]) / cell - 0.5).clamp(-1.0, n[k] as f64);
-            let range = |k: usize| {
-                let (l, h) = (p[0][k].min(p[1][k]).min(p[2][k]), p[0][k].max(p[1][k]).max(p[2][k]));
-                (index(l, k).ceil().max(0.0) as usize, index(h, k).floor())
-            };
-            let ((x0, x1), (y0, y1)) = (range(0), range(1));
-            let mut y = y0;
-            while (y as f64) <= y1 && y < n[1] {
-                let mut x = x0;
-                while (x as f64) <= x1 && x < n[0] {
-                    let q = [lo[0] + (x as f64 + 0.5) * cell, lo[1] + (y as f64 + 0.5) * cell];
-                    let turn = |s: [f64; 2], e: [f64; 2]| (e[0] - s[0]) * (q[1] - s[1]) - (e[1] - s[1]) * (q[0] - s[0]);
-                    let d = [turn(p[0], p[1]), turn(p[1], p[2]), turn(p[2], p[0])];
-                    if d.iter().all(|v| *v >= -1e-15) || d.iter().all(|v| *v <= 1e-15) {
-                        if let Some(c) = on.get_mut(y * n[0] + x) {
-                            *c = true;
-                        }
-                    }
-                    x += 1;
-                }
-                y += 1;
-            }
-        }
-        on
-    };
-    let cells = raster(a)
-        .into_iter()
-        .zip(raster(b))
-        .enumerate()
-        .filter(|(_, (x, y))| *x && *y)
-        .map(|(k, _)| [lo[0] + ((k % n[0]) as f64 + 0.5) * cell, lo[1] + ((k / n[0]) as f64 + 0.5) * cell])
-        .collect();
-    Some(Overlap { origin, u, v, cell, cells })
-}
-
-/// Directions in which claws can come in: across each side of the overlap's outline, inwards.
-fn ways_in(o: &Overlap) -> Vec<Vec3> {
-    let hull = hull(&o.cells);
-    let m = hull.len();
-    // Length of the outline by the direction of its inward normal, in bins of 5 degrees.
-    let mut sides: Vec<(f64, f64)> = Vec::new();
-    let mut total = 0.0;
-    for k in 0..m {
-        let (Some(p), Some(q)) = (hull.get(k), hull.get((k + 1) % m)) else { continue };
-        let (dx, dy) = (q[0] - p[0], q[1] - p[1]);
-        let length = dx.hypot(dy);
-        if length <= 0.0 {
+    let flat: Vec<[f64; 2]> = edges.iter().map(|e| [e.dot(&u), e.dot(&v)]).collect();
+    // Along the part's own edges, so that its sides run along rows of cells.
+    let (s, c) = main_direction(&flat).sin_cos();
+    let (u, v) = (u * c + v * s, v * c - u * s);
+    let flat: Vec<[f64; 2]> = edges.iter().map(|e| [e.dot(&u), e.dot(&v)]).collect();
+    let origin = (faces[0].centre + faces[1].centre) * 0.5;
+    let Some(grid) = Grid::over(mesh, faces, origin, [u, v, *closing]) else { return Vec::new() };
+    let (top, bottom) = (grid.heights(mesh, faces[0], 1.0), grid.heights(mesh, faces[1], -1.0));
+    let both: Vec<bool> = top.iter().zip(&bottom).map(|(a, b)| !a.is_nan() && !b.is_nan()).collect();
+    // A scan's faces are ragged by about a triangle; a rim of few long edges is exact.
+    let edge = edges.iter().map(|e| e.norm()).sum::<f64>() / edges.len().max(1) as f64;
+    let ragged = if edge < 3.0 * grid.cell { 1.5 * edge } else { 0.0 };
+    let mut out = Vec::new();
+    for part in grid.parts(&both) {
+        let cell = grid.cell;
+        if (part.len() as f64) * cell * cell < least {
             continue;
         }
-        total += length;
-        // The hull runs counter-clockwise, so the inside is to the left.
-        let angle = dx.atan2(-dy);
-        let near = |a: f64| (a - angle + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU) - std::f64::consts::PI;
-        match sides.iter_mut().find(|(a, _)| near(*a).abs() < 12f64.to_radians()) {
-            Some((a, l)) => {
-                // The weighted mean of both, the short way round.
-                *a -= near(*a) * length / (*l + length);
-                *l += length;
-            }
-            None => sides.push((angle, length)),
-        }
+        let get = |h: &[f64], k: usize| h.get(k).copied().unwrap_or(0.0);
+        let overlap = Overlap {
+            origin,
+            u,
+            v,
+            cell,
+            cells: part.iter().map(|k| grid.at(*k)).collect(),
+            heights: part.iter().map(|k| [get(&top, *k), get(&bottom, *k)]).collect(),
+        };
+        let ways = ways_in(&overlap, &grid.sides(&part, ragged), if ragged > 0.0 { &[] } else { &flat });
+        out.push((overlap, ways));
     }
-    sides.retain(|(_, l)| *l > 0.06 * total);
-    sides.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.total_cmp(&b.0)));
-    sides.iter().map(|(a, _)| o.u * a.cos() + o.v * a.sin()).collect()
+    out
 }
 
-/// Convex hull, counter-clockwise (Andrew's monotone chain), with the staircase of the raster's slanted sides already convex.
-fn hull(cells: &[[f64; 2]]) -> Vec<[f64; 2]> {
-    let mut p = cells.to_vec();
-    p.sort_by(|a, b| a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])));
-    let turn = |a: &[f64; 2], b: &[f64; 2], c: &[f64; 2]| (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
-    let half = |points: &mut dyn Iterator<Item = &[f64; 2]>| {
-        let mut out: Vec<[f64; 2]> = Vec::new();
-        for q in points {
-            while let [.., a, b] = out.as_slice() {
-                if turn(a, b, q) > 1e-15 {
-                    break;
-                }
-                out.pop();
-            }
-            out.push(*q);
+/// The direction, modulo a right angle, along which most of some edges run, radians.
+fn main_direction(edges: &[[f64; 2]]) -> f64 {
+    let mut bins = [0.0f64; 90];
+    let angle = |e: &[f64; 2]| e[1].atan2(e[0]).rem_euclid(FRAC_PI_2);
+    let bin = |a: f64| ((a.to_degrees() + 0.5) as usize) % 90;
+    for e in edges {
+        if let Some(b) = bins.get_mut(bin(angle(e))) {
+            *b += e[0].hypot(e[1]);
         }
-        out.pop();
-        out
+    }
+    let best = (0..90).fold(0, |a, k| if bins.get(k) > bins.get(a) { k } else { a });
+    let centre = (best as f64).to_radians();
+    let (mut sum, mut length) = (0.0, 0.0);
+    for e in edges {
+        let off = (angle(e) - centre + 0.5 * FRAC_PI_2).rem_euclid(FRAC_PI_2) - 0.5 * FRAC_PI_2;
+        if off.abs() < 1.5f64.to_radians() {
+            sum += off * e[0].hypot(e[1]);
+            length += e[0].hypot(e[1]);
+        }
+    }
+    centre + if length > 0.0 { sum / length } else { 0.0 }
+}
+
+/// Sides that differ by less are one way in: 20 degrees.
+const SAME_WAY: f64 = 0.35;
+/// A side is a way in when it is this long, metres, and this part of the overlap's width there (a chamfer is not), ...
+const SIDE: (f64, f64) = (4e-3, 0.08);
+/// ... or when it is this part of the width: the end of a thin plate.
+const WHOLE_SIDE: f64 = 0.25;
+/// A side that is this near to a right angle with the longest one is taken to be at one: 10 degrees, what a scan's ragged corners do.
+const NEARLY_SQUARE: f64 = 0.175;
+
+/// Directions in which claws can come in: across each side of the overlap's outline, inwards. `edges` are those of the faces, where they are straight.
+fn ways_in(o: &Overlap, sides: &[[[f64; 2]; 2]], edges: &[[f64; 2]]) -> Vec<Vec3> {
+    let apart = |a: f64, b: f64| (a - b + PI).rem_euclid(TAU) - PI;
+    // Directions along the outline, the inside to the left, with their lengths; the longest first.
+    let mut all: Vec<(f64, f64)> =
+        sides.iter().map(|[p, q]| ((q[1] - p[1]).atan2(q[0] - p[0]), (q[0] - p[0]).hypot(q[1] - p[1]))).collect();
+    all.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.total_cmp(&b.0)));
+    let mut ways: Vec<(f64, f64)> = Vec::new();
+    for (angle, length) in all {
+        match ways.iter_mut().find(|(a, _)| apart(*a, angle).abs() < SAME_WAY) {
+            Some((_, l)) => *l += length,
+            None => ways.push((angle, length)),
+        }
+    }
+    ways.retain(|(angle, length)| {
+        let (s, c) = angle.sin_cos();
+        let along = o.cells.iter().map(|q| q[0] * c + q[1] * s);
+        let (lo, hi) = along.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), x| (a.min(x), b.max(x)));
+        let part = length / (hi - lo + o.cell);
+        part >= WHOLE_SIDE || (*length >= SIDE.0 && part >= SIDE.1)
+    });
+    ways.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.total_cmp(&b.0)));
+    let exact = |angle: f64, length: f64| {
+        // The mesh's own edges know the side's direction better than cells do, where they are straight.
+        let (mut sum, mut total) = (0.0, 0.0);
+        for e in edges {
+            let off = (e[1].atan2(e[0]) - angle + FRAC_PI_2).rem_euclid(PI) - FRAC_PI_2;
+            if off.abs() < 2.5f64.to_radians() {
+                sum += off * e[0].hypot(e[1]);
+                total += e[0].hypot(e[1]);
+            }
+        }
+        (total > 0.5 * length).then(|| angle + sum / total)
     };
-    let mut lower = half(&mut p.iter());
-    lower.extend(half(&mut p.iter().rev()));
-    lower
+    // A handle is a box: what is nearly square to its longest side is meant to be, where no straight edge says otherwise.
+    let main = ways.first().map_or(0.0, |(angle, length)| exact(*angle, *length).unwrap_or(*angle));
+    let square = |angle: f64| {
+        let off = (angle - main + 0.5 * FRAC_PI_2).rem_euclid(FRAC_PI_2) - 0.5 * FRAC_PI_2;
+        if off.abs() < NEARLY_SQUARE { angle - off } else { angle }
+    };
+    ways.iter()
+        .map(|(angle, length)| {
+            let (s, c) = exact(*angle, *length).unwrap_or(square(*angle)).sin_cos();
+            o.v * c - o.u * s
+        })
+        .collect()
 }

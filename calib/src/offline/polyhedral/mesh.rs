@@ -1,7 +1,8 @@
 //! A triangle mesh with shared vertices.
 
 use graspd_rt::geom::Vec3;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
+use std::hash::{BuildHasherDefault, Hasher};
 
 /// Triangles with shared vertices, metres, in the mesh's own frame.
 #[derive(Clone, Debug, PartialEq)]
@@ -13,7 +14,8 @@ pub struct Mesh {
 }
 
 impl Mesh {
-    /// Welds separate triangles; those without area or with corners that are not finite are left out. `None` when nothing is left.
+    /// Welds separate triangles. Those without area, those given twice and those with corners that are not finite are left out. `None` when
+    /// nothing is left.
     pub fn from_corners(corners: impl IntoIterator<Item = [Vec3; 3]>) -> Option<Self> {
         let all: Vec<[Vec3; 3]> = corners
             .into_iter()
@@ -24,26 +26,23 @@ impl Mesh {
             lo = lo.inf(v);
             hi = hi.sup(v);
         }
-        // Files hold single precision: corners closer than that are one.
-        let grid = ((hi - lo).norm() * 2e-7).max(1e-12);
-        let mut known: HashMap<[i64; 3], u32> = HashMap::new();
-        let mut out = Self { vertices: Vec::new(), triangles: Vec::new() };
+        let mut weld = Weld::new(lo, hi);
+        let (mut triangles, mut given) =
+            (Vec::with_capacity(all.len()), HashSet::with_capacity_and_hasher(all.len(), Mix::default()));
         for t in &all {
             let mut ids = [0u32; 3];
             for (id, v) in ids.iter_mut().zip(t) {
-                let key = [0, 1, 2].map(|k| ((v[k] - lo[k]) / grid).round() as i64);
-                let next = u32::try_from(out.vertices.len()).ok()?;
-                *id = *known.entry(key).or_insert_with(|| {
-                    out.vertices.push(*v);
-                    next
-                });
+                *id = weld.index(v)?;
             }
             let [a, b, c] = ids;
-            if a != b && b != c && a != c && (t[1] - t[0]).cross(&(t[2] - t[0])).norm() > grid * grid {
-                out.triangles.push(ids);
+            let area = (t[1] - t[0]).cross(&(t[2] - t[0])).norm();
+            let mut key = ids;
+            key.sort_unstable();
+            if a != b && b != c && a != c && area > weld.near * weld.near && given.insert(key) {
+                triangles.push(ids);
             }
         }
-        (!out.triangles.is_empty()).then_some(out)
+        (!triangles.is_empty()).then_some(Self { vertices: weld.vertices, triangles })
     }
 
     /// Corners of a triangle.
@@ -72,5 +71,70 @@ impl Mesh {
             area += w;
         }
         sum / area.max(1e-300)
+    }
+}
+
+/// Makes one of corners that are nearer to each other than single precision tells apart.
+struct Weld {
+    lo: Vec3,
+    /// Corners this near are one, metres.
+    near: f64,
+    known: HashMap<[i32; 3], Vec<u32>, Mix>,
+    vertices: Vec<Vec3>,
+}
+
+impl Weld {
+    /// Side of a cell in units of `near`: most corners are further from its border than that, and have one cell to look into.
+    const CELL: f64 = 16.0;
+
+    fn new(lo: Vec3, hi: Vec3) -> Self {
+        // Files hold single precision, of the distance from their origin too; a part may stand far from it.
+        let most = lo.iter().chain(hi.iter()).fold((hi - lo).norm(), |a, x| a.max(x.abs()));
+        Self { lo, near: (most * 2e-7).max(1e-12), known: HashMap::default(), vertices: Vec::new() }
+    }
+
+    fn index(&mut self, v: &Vec3) -> Option<u32> {
+        let at = [0, 1, 2].map(|k| (v[k] - self.lo[k]) / (self.near * Self::CELL));
+        let own = at.map(|x| x.floor() as i32);
+        // Cells that the corner is near to, along each axis: its own, and the next one where it stands at the border.
+        let edge = 1.0 / Self::CELL;
+        let reach = [0, 1, 2].map(|k| {
+            let part = at[k] - at[k].floor();
+            (own[k] - i32::from(part < edge), own[k] + i32::from(part > 1.0 - edge))
+        });
+        for i in reach[0].0..=reach[0].1 {
+            for j in reach[1].0..=reach[1].1 {
+                for k in reach[2].0..=reach[2].1 {
+                    for id in self.known.get(&[i, j, k]).into_iter().flatten() {
+                        if self.vertices.get(*id as usize).is_some_and(|w| (w - v).norm() <= self.near) {
+                            return Some(*id);
+                        }
+                    }
+                }
+            }
+        }
+        let id = u32::try_from(self.vertices.len()).ok()?;
+        self.vertices.push(*v);
+        self.known.entry(own).or_default().push(id);
+        Some(id)
+    }
+}
+
+type Mix = BuildHasherDefault<Mixer>;
+
+/// A plain multiplicative hash: a scan has a million corners, and nobody attacks the table but its own file's size.
+#[derive(Default)]
+struct Mixer(u64);
+
+impl Hasher for Mixer {
+    fn finish(&self) -> u64 {
+        self.0 ^ (self.0 >> 29)
+    }
+
+    fn write(&mut self, bytes: &[u8]) {
+        for chunk in bytes.chunks(8) {
+            let word = chunk.iter().rev().fold(0u64, |a, b| a << 8 | u64::from(*b));
+            self.0 = (self.0.rotate_left(23) ^ word).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+        }
     }
 }

@@ -7,13 +7,18 @@ pub mod bvh;
 pub mod faces;
 pub mod filter;
 pub mod handles;
+mod links;
 mod mesh;
 mod obj;
 pub mod overlay;
+mod place;
 pub mod plan;
 pub mod pose;
+mod raster;
 pub mod reach;
 pub mod read;
+pub mod report;
+mod smooth;
 mod stl;
 pub mod topology;
 

@@ -8,9 +8,15 @@ const FIX: &str = "repair or export the part again";
 
 /// Corners of every triangle, in the file's unit; faces of more corners are cut into triangles.
 pub(super) fn read(bytes: &[u8]) -> Result<Vec<[Vec3; 3]>, Problem> {
-    let text = String::from_utf8_lossy(bytes);
+    let mut text = String::from_utf8_lossy(bytes);
+    if text.contains('\r') {
+        // Old programs end lines with a carriage return alone.
+        text = text.replace("\r\n", "\n").replace('\r', "\n").into();
+    }
     let mut vertices: Vec<Vec3> = Vec::new();
-    let mut out = Vec::new();
+    // Corners of all faces; some programs write them before the vertices.
+    let mut corners: Vec<u32> = Vec::new();
+    let mut faces: Vec<(usize, std::ops::Range<usize>)> = Vec::new();
     let mut open: Option<(usize, String)> = None;
     for (k, raw) in text.lines().enumerate() {
         let line = raw.split('#').next().unwrap_or("").trim_end();
@@ -37,29 +43,21 @@ pub(super) fn read(bytes: &[u8]) -> Result<Vec<[Vec3; 3]>, Problem> {
                 }
             }
             Some("f") => {
-                let corners: Vec<Vec3> = words
-                    .map(|w| {
-                        let first = w.split('/').next().unwrap_or("");
-                        let index: i64 =
-                            first.parse().map_err(|_| wrong(format!("\"{w}\" is not a corner of a face")))?;
-                        // Counted from 1, or backwards from the last one read.
-                        let at = if index > 0 { index - 1 } else { vertices.len() as i64 + index };
-                        usize::try_from(at)
-                            .ok()
-                            .filter(|_| index != 0)
-                            .and_then(|i| vertices.get(i))
-                            .copied()
-                            .ok_or_else(|| {
-                                wrong(format!("the face names vertex {index}, but {} were read so far", vertices.len()))
-                            })
-                    })
-                    .collect::<Result<_, _>>()?;
-                if corners.len() < 3 {
-                    return Err(wrong(format!("a face has {} corners", corners.len())));
+                let from = corners.len();
+                for w in words {
+                    let first = w.split('/').next().unwrap_or("");
+                    let index: i64 = first.parse().map_err(|_| wrong(format!("\"{w}\" is not a corner of a face")))?;
+                    // Counted from 1, or backwards from the last one read.
+                    let at = if index > 0 { Some(index - 1) } else { (vertices.len() as i64).checked_add(index) };
+                    let at = at.and_then(|k| u32::try_from(k).ok()).filter(|_| index != 0);
+                    corners.push(at.ok_or_else(|| {
+                        wrong(format!("the face names vertex {index}, but {} were read so far", vertices.len()))
+                    })?);
                 }
-                cut(&corners, &mut out).ok_or_else(|| {
-                    wrong(format!("the outline of a face with {} corners crosses itself", corners.len()))
-                })?;
+                if corners.len() - from < 3 {
+                    return Err(wrong(format!("a face has {} corners", corners.len() - from)));
+                }
+                faces.push((line_no, from..corners.len()));
             }
             _ => {}
         }
@@ -69,6 +67,22 @@ pub(super) fn read(bytes: &[u8]) -> Result<Vec<[Vec3; 3]>, Problem> {
             format!("line {line_no}: it ends inside a continued line"),
             "the file is cut off: copy it again",
         ));
+    }
+    let mut out = Vec::with_capacity(faces.len());
+    for (line_no, range) in faces {
+        let wrong = |what: String| Problem::new(format!("line {line_no}: {what}"), FIX);
+        let face: Vec<Vec3> = corners
+            .get(range)
+            .unwrap_or(&[])
+            .iter()
+            .map(|k| {
+                let count = vertices.len();
+                let wrong = || wrong(format!("the face names vertex {}, but the file has {count}", u64::from(*k) + 1));
+                vertices.get(*k as usize).copied().ok_or_else(wrong)
+            })
+            .collect::<Result<_, _>>()?;
+        cut(&face, &mut out)
+            .ok_or_else(|| wrong(format!("the outline of a face with {} corners crosses itself", face.len())))?;
     }
     Ok(out)
 }

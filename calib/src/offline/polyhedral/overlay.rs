@@ -42,11 +42,17 @@ pub fn draw(
         (None, [Some(l), Some(r)]) => [l, r],
         _ => return None,
     };
-    let (zoom, unit) = scales(pictures);
+    let cuts = close_up(plan, mesh, placed, pictures, rig, gripper);
+    let cropped = [cuts[0].picture(pictures[0])?, cuts[1].picture(pictures[1])?];
+    let (zoom, unit) = scales([&cropped[0], &cropped[1]]);
     let mut panels = Vec::new();
-    for (view, picture) in View::BOTH.into_iter().zip(pictures) {
-        let mut panel = Panel::new(picture, view, rig, zoom)?;
-        draw_view(&mut panel, view, plan, survey, mesh, placed, rig, gripper, unit);
+    for (view, (whole, cut)) in View::BOTH.into_iter().zip(pictures.into_iter().zip(cuts)) {
+        let near = cut.rig(view, rig);
+        let mut panel = Panel::new(&cropped[view.index()], view, &near, zoom)?;
+        draw_view(&mut panel, view, plan, survey, mesh, placed, &near, gripper, unit, &cut);
+        if cut.width < whole.width() {
+            inset(&mut panel, whole, view, rig, &cut, unit);
+        }
         panels.push(panel.canvas);
     }
     sheet(
@@ -61,9 +67,100 @@ pub fn draw(
             ("  marks", MARK),
             ("  picks", CLICK),
         ],
-        &caption(plan, placed),
+        &caption(plan, survey, placed),
         &plan.file.warnings,
     )
+}
+
+/// The part of a view that is drawn, pixels.
+#[derive(Clone, Copy, Debug)]
+struct Cut {
+    x: usize,
+    y: usize,
+    width: usize,
+    height: usize,
+}
+
+impl Cut {
+    fn picture(&self, whole: &Picture) -> Option<Picture> {
+        let rows = (self.y..self.y + self.height).filter_map(|y| whole.row(y).get(self.x..self.x + self.width));
+        Picture::new(self.width, self.height, rows.flatten().copied().collect())
+    }
+
+    fn offset(&self) -> Pixel {
+        Pixel::new(self.x as f64, self.y as f64)
+    }
+
+    /// The rig as if the view's camera took only this part: its axis is where it was, so that its lens is the same.
+    fn rig(&self, view: View, rig: &RigFile) -> RigFile {
+        let mut out = rig.clone();
+        let camera = if view == View::Left { &mut out.rig.left } else { &mut out.rig.right };
+        camera.cx -= self.x as f64;
+        camera.cy -= self.y as f64;
+        (camera.width, camera.height) = (self.width as u32, self.height as u32);
+        out
+    }
+}
+
+/// The cut's sides are this much longer than what has to be in it, and at least this part of the picture; a larger one is the whole picture.
+const ROOM: f64 = 1.25;
+const LEAST_CUT: f64 = 0.12;
+const MOST_CUT: f64 = 0.7;
+
+/// Where part and gripper are in both views, equally large in both.
+fn close_up(
+    plan: &MeshPlan,
+    mesh: &Mesh,
+    placed: &Placed,
+    whole: [&Picture; 2],
+    rig: &RigFile,
+    gripper: &GripperFile,
+) -> [Cut; 2] {
+    let full = whole.map(|p| Cut { x: 0, y: 0, width: p.width(), height: p.height() });
+    let (mut lo, mut hi) = (Vec3::repeat(f64::INFINITY), Vec3::repeat(f64::NEG_INFINITY));
+    for v in &mesh.vertices {
+        (lo, hi) = (lo.inf(v), hi.sup(v));
+    }
+    let corner = |i: usize| Vec3::from_fn(|k, _| if i >> k & 1 == 1 { hi[k] } else { lo[k] });
+    let mut points: Vec<Vec3> = (0..8).map(|i| (placed.left_from_mesh * Point3::from(corner(i))).coords).collect();
+    for pose in [&plan.set_point.pregrasp.left_from_gripper, &plan.set_point.grasp.left_from_gripper] {
+        points.extend(boxes(gripper, plan.file.opening_m, pose).iter().flat_map(|(b, _)| b.corners()));
+    }
+    let mut part = LEAST_CUT;
+    let mut middles = [Pixel::zeros(); 2];
+    for (view, (middle, size)) in View::BOTH.into_iter().zip(middles.iter_mut().zip(&full)) {
+        let mut seen = points.iter().filter_map(|p| rig.rig.project(view, p));
+        let Some(first) = seen.next() else { return full };
+        let (a, b) = seen.fold((first, first), |(a, b), p| (a.inf(&p), b.sup(&p)));
+        *middle = (a + b) * 0.5;
+        let d = (b - a) * ROOM;
+        part = part.max(d.x / size.width as f64).max(d.y / size.height as f64);
+    }
+    if !(part < MOST_CUT) {
+        return full;
+    }
+    let mut out = full;
+    for (cut, middle) in out.iter_mut().zip(middles) {
+        let (w, h) = ((part * cut.width as f64) as usize, (part * cut.height as f64) as usize);
+        let from = |m: f64, size: usize, all: usize| (m - 0.5 * size as f64).clamp(0.0, (all - size) as f64) as usize;
+        *cut = Cut { x: from(middle.x, w, cut.width), y: from(middle.y, h, cut.height), width: w, height: h };
+    }
+    out
+}
+
+/// The whole view, small in a corner, with a frame round what is drawn.
+fn inset(panel: &mut Panel<'_>, whole: &Picture, view: View, rig: &RigFile, cut: &Cut, unit: f64) {
+    let (w, h) = (f64::from(panel.canvas.pixmap.width()), f64::from(panel.canvas.pixmap.height()));
+    let zoom = 0.22 * w / whole.width() as f64;
+    let Some(mut small) = Panel::new(whole, view, rig, zoom) else { return };
+    let (a, b) = (small.raw(cut.offset()), small.raw(cut.offset() + Pixel::new(cut.width as f64, cut.height as f64)));
+    let frame = [a, Pixel::new(b.x, a.y), b, Pixel::new(a.x, b.y), a].map(Some);
+    small.canvas.line(&frame, RIM, 1.5 * unit, None);
+    let (sw, sh) = (f64::from(small.canvas.pixmap.width()), f64::from(small.canvas.pixmap.height()));
+    let gap = 8.0 * unit;
+    let (x, y) = (w - sw - gap, h - sh - gap);
+    panel.canvas.rectangle(x - 2.0, y - 2.0, sw + 4.0, sh + 4.0, [240, 246, 252, 255]);
+    panel.canvas.place(x as i32, y as i32, &small.canvas);
 }
 
 #[allow(clippy::too_many_arguments)]
@@ -77,6 +174,7 @@ fn draw_view(
     rig: &RigFile,
     gripper: &GripperFile,
     unit: f64,
+    cut: &Cut,
 ) {
     let left = placed.left_from_mesh;
     let opening = plan.file.opening_m;
@@ -93,10 +191,14 @@ fn draw_view(
         panel.canvas.arrow(a, b, [10, 20, 30, 160], 4.2 * unit);
         panel.canvas.arrow(a, b, NORMAL, 2.4 * unit);
     }
-    panel.marks(&plan.set_point.grasp, gripper, unit);
-    for p in &placed.record.picked {
+    let mut goal = plan.set_point.grasp;
+    for px in goal.marks.iter_mut().flatten().flatten() {
+        *px -= cut.offset();
+    }
+    panel.marks(&goal, gripper, unit);
+    for (k, p) in placed.record.picked.iter().enumerate() {
         let px = if view == View::Left { p.left_px } else { p.right_px };
-        let at = panel.raw(Pixel::from(px));
+        let at = panel.raw(Pixel::from(px) - cut.offset());
         panel.canvas.ring(at, 6.0 * unit, [0, 0, 0, 180], 3.0 * unit);
         panel.canvas.ring(at, 6.0 * unit, CLICK, 1.4 * unit);
         // Where the pose puts the point that was picked.
@@ -104,6 +206,8 @@ fn draw_view(
             panel.canvas.segment(at, q, NORMAL, 1.2 * unit);
             panel.canvas.dot(q, 1.6 * unit, NORMAL);
         }
+        let beside = at + Pixel::new(-11.0, -9.0) * unit;
+        panel.canvas.label(beside, &format!("{}", k + 1), Face::Small, unit.round().max(1.0) as u32, CLICK);
     }
     let best = plan.set_point.best_view == view;
     let name = match (view, best) {
@@ -119,10 +223,8 @@ fn draw_view(
 
 /// The lines that an eye (in the mesh's frame) sees of a mesh.
 fn lines(mesh: &Mesh, survey: &Survey<'_>, eye: &Vec3) -> Vec<Line> {
-    let normal = |t: u32| {
-        let [a, b, c] = mesh.corners(t as usize);
-        (b - a).cross(&(c - a)).try_normalize(0.0)
-    };
+    let normals = normals(mesh);
+    let normal = |t: u32| normals.get(t as usize).copied().flatten();
     let vertex = |k: u32| mesh.vertices.get(k as usize).copied().unwrap_or_default();
     let skin = 2e-3 * mesh.size().norm();
     let mut out = Vec::new();
@@ -148,8 +250,31 @@ fn lines(mesh: &Mesh, survey: &Survey<'_>, eye: &Vec3) -> Vec<Line> {
     out
 }
 
+/// Triangles from which on a mesh is taken for a scan, whose crumples are no edges.
+const SCAN: usize = 20_000;
+
+/// Unit normals of the triangles; of a scan, averaged over those around.
+fn normals(mesh: &Mesh) -> Vec<Option<Vec3>> {
+    let mut out: Vec<Vec3> =
+        (0..mesh.triangles.len()).map(|t| mesh.corners(t)).map(|[a, b, c]| (b - a).cross(&(c - a))).collect();
+    for _ in 0..if out.len() > SCAN { 2 } else { 0 } {
+        let mut at = vec![Vec3::zeros(); mesh.vertices.len()];
+        for (n, t) in out.iter().zip(&mesh.triangles) {
+            for k in t {
+                if let Some(v) = at.get_mut(*k as usize) {
+                    *v += n;
+                }
+            }
+        }
+        for (n, t) in out.iter_mut().zip(&mesh.triangles) {
+            *n = t.iter().filter_map(|k| at.get(*k as usize)).sum();
+        }
+    }
+    out.iter().map(|n| n.try_normalize(0.0)).collect()
+}
+
 /// The figures under the pictures.
-fn caption(plan: &MeshPlan, placed: &Placed) -> Vec<Vec<(&'static str, String)>> {
+fn caption(plan: &MeshPlan, survey: &Survey<'_>, placed: &Placed) -> Vec<Vec<(&'static str, String)>> {
     let mm = |v: f64| format!("{:.1}", v * 1e3);
     let (o, m, j) = (&plan.file.object, &placed.record, &plan.chosen);
     let [x, y, z] = m.size_m.map(mm);
@@ -169,10 +294,10 @@ fn caption(plan: &MeshPlan, placed: &Placed) -> Vec<Vec<(&'static str, String)>>
         ("picks", picks),
     ];
     let seen = |k: usize| plan.set_point.grasp.marks.get(k).map_or(0, |m| m.iter().flatten().count());
-    let taken = plan.file.candidate.iter().filter(|c| !c.verdict.starts_with("dropped")).count();
+    let taken = survey.handles.iter().filter(|j| j.reason.is_none()).count();
     let third = vec![
         ("marks", format!("{} left, {} right", seen(0), seen(1))),
-        ("handles", format!("{taken} of {} can be taken", plan.file.candidate.len())),
+        ("handles", format!("{taken} of {} can be taken", survey.handles.len())),
         ("grasp", format!("({}) mm", at(&plan.set_point.grasp.left_from_gripper))),
     ];
     vec![first, second, third]

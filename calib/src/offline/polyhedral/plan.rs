@@ -36,7 +36,7 @@ pub struct MeshOptions {
     pub max_turn: Option<f64>,
     /// Largest acceptable standard deviation of the handle's place, metres.
     pub max_sigma: f64,
-    /// Largest acceptable standard deviation of the approach, radians.
+    /// Largest acceptable standard deviation of the gripper's orientation about any axis, radians.
     pub max_sigma_turn: f64,
 }
 
@@ -142,7 +142,7 @@ pub enum MeshPlanError {
         sigma_mm: f64,
         /// The limit.
         limit_mm: f64,
-        /// Standard deviation of the approach about the worst axis, degrees.
+        /// Standard deviation of the orientation about the worst axis, degrees.
         sigma_deg: f64,
         /// The limit.
         limit_deg: f64,
@@ -159,7 +159,7 @@ pub fn survey<'a>(
     options: &MeshOptions,
 ) -> Survey<'a> {
     let tree = Bvh::new(mesh);
-    let faces = faces(mesh, &options.flat);
+    let faces = faces(mesh, &tree, &options.flat);
     let found = enumerate(mesh, &faces, &options.opposition);
     let situation = Situation {
         rig: Some(&rig.rig),
@@ -332,7 +332,8 @@ fn object_record(chosen: &Judged, placed: &Placed, options: &MeshOptions) -> Res
     let turn = to_object.matrix() * cov_turn * to_object.matrix().transpose();
     // A small rotation w moves the normal by (w_y, -w_x) in the object's frame.
     let cov_normal = nalgebra::Matrix2::new(turn[(1, 1)], -turn[(0, 1)], -turn[(0, 1)], turn[(0, 0)]);
-    let (sigma, sigma_turn) = (worst(&cov_centre), worst(&cov_normal));
+    // A turn about the approach leaves the normal where it is, but not the claws on the faces: the limit is for all three.
+    let (sigma, sigma_turn) = (worst(&cov_centre), worst(&turn));
     if !(sigma <= options.max_sigma && sigma_turn <= options.max_sigma_turn) {
         return Err(MeshPlanError::TooUncertain {
             sigma_mm: sigma * 1e3,
@@ -350,7 +351,7 @@ fn object_record(chosen: &Judged, placed: &Placed, options: &MeshOptions) -> Res
         bar_radius_m: None,
         left_from_object: PoseRecord::of(&frame),
         sigma_centre_mm: sigma * 1e3,
-        sigma_normal_deg: sigma_turn.to_degrees(),
+        sigma_normal_deg: worst(&cov_normal).to_degrees(),
         covariance_centre_m2: std::array::from_fn(|i| std::array::from_fn(|j| cov_centre[(i, j)] + 0.0)),
         covariance_normal_rad2: std::array::from_fn(|i| std::array::from_fn(|j| cov_normal[(i, j)] + 0.0)),
         covariance_axes_m2: [[0.0; 2]; 2],

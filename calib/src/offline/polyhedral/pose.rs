@@ -22,7 +22,7 @@ pub struct MeshPose {
     pub left_from_mesh: Pose,
     /// Root mean square reprojection error over both views, pixels.
     pub rms_px: f64,
-    /// Covariance of a small body motion `[v; w]` of the mesh, metres and radians, for picks of the scatter seen (but at least one pixel).
+    /// Covariance of a small body motion `[v; w]` of the mesh, metres and radians, for picks of the scatter seen.
     pub covariance: Matrix6<f64>,
 }
 
@@ -35,6 +35,11 @@ pub enum PickError {
     /// Points on one line, or a pixel that is none.
     #[error("the picked points do not determine a pose ({0}): pick corners that are spread over the part")]
     Degenerate(&'static str),
+    /// The rays of a pick diverge.
+    #[error(
+        "the two pixels of picked point {0} do not meet in front of the cameras: check that its left and right pixels are not exchanged"
+    )]
+    Behind(usize),
     /// One pick does not fit the others.
     #[error(
         "picked point {worst} is {error_px:.1} px from where the others put it (limit {limit_px:.1}): pick it again, or check which corner of the mesh it is"
@@ -47,77 +52,235 @@ pub enum PickError {
         /// The limit.
         limit_px: f64,
     },
+    /// Some picks do not fit the others.
+    #[error(
+        "picked points {which} are up to {error_px:.1} px from where the other {others} put them (limit {limit_px:.1}): pick them again, or check which corners of the mesh they are"
+    )]
+    Outliers {
+        /// Their places in the list, counted from 1.
+        which: String,
+        /// How many agree.
+        others: usize,
+        /// The largest reprojection error, pixels.
+        error_px: f64,
+        /// The limit.
+        limit_px: f64,
+    },
+    /// Two picks were exchanged.
+    #[error("picked points {0} and {1} are exchanged: each fits the pixels of the other")]
+    Exchanged(usize, usize),
+    /// The picks are those of the mirrored mesh.
+    #[error(
+        "the picked points fit the mirror image of the mesh, not the mesh: check which corners were picked, or whether the mesh was exported mirrored"
+    )]
+    Mirrored,
+    /// The picks are those of a mesh of another size.
+    #[error("the picked points fit a part {0:.3} times as large as the mesh: check --mesh-unit")]
+    Scale(f64),
+    /// No majority of the picks agrees on a pose.
+    #[error(
+        "no pose fits more than {agree} of the {count} picked points within {limit_px:.1} px: check which corners of the mesh were picked"
+    )]
+    Contradiction {
+        /// Most picks that agree.
+        agree: usize,
+        /// All of them.
+        count: usize,
+        /// The limit, pixels.
+        limit_px: f64,
+    },
 }
 
-/// Fits the mesh's pose to picked points: triangulation and the closed form of Horn, then least squares on all pixels.
+/// Nobody picks a corner better than this, however well few picks happen to agree, pixels.
+const LEAST_SIGMA_PX: f64 = 0.2;
+/// Triples of picks from which a pose is tried when not all agree.
+const MOST_TRIPLES: usize = 4000;
+/// Picks stand on one line when their second spread is less than this part of the first (of the variances; a hundredth in lengths).
+const LINE: f64 = 1e-4;
+/// A part that is this much larger or smaller than its mesh has another unit, or is another part.
+const OTHER_SIZE: f64 = 0.02;
+
+/// Fits the mesh's pose to picked points: triangulation and the closed form of Horn, then least squares on all pixels. Needs no first guess.
+///
+/// The covariance takes the noise of a pixel from the picks' own scatter: with `d` degrees of freedom, the sum of squares over `d - 2`, so that the
+/// mean squared Mahalanobis distance of the true pose is 6 however few they are.
+///
+/// # Errors
+/// Too few picks, picks on one line, and every way in which they contradict each other by more than `limit_px`: which of them do not fit, whether
+/// two were exchanged, whether the mesh is mirrored or of another size.
 pub fn fit(rig: &Rig, picked: &[Picked], limit_px: f64) -> Result<MeshPose, PickError> {
-    let (pose, information) = solve(rig, picked)?;
-    let mut sum = 0.0;
-    let (mut worst, mut most) = (0, 0.0f64);
-    for (k, p) in picked.iter().enumerate() {
-        for e in errors(rig, &pose, p) {
-            sum += e * e;
-            if !(e <= most) {
-                (worst, most) = (k + 1, e);
+    if picked.len() < 3 {
+        return Err(PickError::TooFew(picked.len()));
+    }
+    let finite =
+        |p: &Picked| [p.left.x, p.left.y, p.right.x, p.right.y].iter().chain(p.point.iter()).all(|v| v.is_finite());
+    if !picked.iter().all(finite) {
+        return Err(PickError::Degenerate("a number is not finite"));
+    }
+    if !spread(picked) {
+        return Err(PickError::Degenerate("they lie on one line"));
+    }
+    let lenses = View::BOTH.map(|v| Lens::new(rig.camera(v)));
+    let seen: Vec<Option<Vec3>> = picked.iter().map(|p| triangulate(rig, &lenses, p)).collect();
+    let known: Vec<usize> = (0..picked.len()).filter(|k| seen.get(*k).is_some_and(Option::is_some)).collect();
+    if let Some(k) = seen.iter().position(Option::is_none).filter(|_| known.len() < 3 || picked.len() < 5) {
+        return Err(PickError::Behind(k + 1));
+    }
+    let all = Trial { rig, picked, seen: &seen };
+    if let Some(found) = all.of(&known).filter(|f| known.len() == picked.len() && all.worst(&f.0) <= limit_px) {
+        let (pose, information) = found;
+        let sum: f64 = picked.iter().flat_map(|p| errors(rig, &pose, p)).map(|e| e * e).sum();
+        let freedom = (4 * picked.len()) as f64 - 6.0;
+        let sigma2 = (sum / (freedom - 2.0)).max(LEAST_SIGMA_PX * LEAST_SIGMA_PX);
+        let covariance = information.try_inverse().ok_or(PickError::Degenerate("they lie on one line"))? * sigma2;
+        return Ok(MeshPose { left_from_mesh: pose, rms_px: (sum / (2.0 * picked.len() as f64)).sqrt(), covariance });
+    }
+    Err(explain(&all, &known, limit_px))
+}
+
+/// Picks with the places in space where their rays meet.
+struct Trial<'a> {
+    rig: &'a Rig,
+    picked: &'a [Picked],
+    seen: &'a [Option<Vec3>],
+}
+
+impl Trial<'_> {
+    /// The pose and information by some of the picks.
+    fn of(&self, some: &[usize]) -> Option<(Pose, Matrix6<f64>)> {
+        let picks: Vec<Picked> = some.iter().filter_map(|k| self.picked.get(*k).copied()).collect();
+        let seen: Vec<Vec3> = some.iter().filter_map(|k| self.seen.get(*k).copied().flatten()).collect();
+        (spread(&picks) && seen.len() == picks.len()).then_some(())?;
+        refine(self.rig, &picks, align(&picks, &seen)?)
+    }
+
+    /// The larger error of each pick's two pixels at a pose.
+    fn errors(&self, pose: &Pose) -> Vec<f64> {
+        self.picked.iter().map(|p| errors(self.rig, pose, p).into_iter().fold(0.0, f64::max)).collect()
+    }
+
+    fn worst(&self, pose: &Pose) -> f64 {
+        self.errors(pose).into_iter().fold(0.0, f64::max)
+    }
+
+    /// The picks of the pose on which most agree, by trying triples.
+    fn consensus(&self, known: &[usize], limit: f64) -> Vec<usize> {
+        let n = known.len();
+        let mut triples = Vec::new();
+        for i in 0..n {
+            for j in i + 1..n {
+                triples.extend((j + 1..n).map(|k| [i, j, k]));
+            }
+        }
+        let step = triples.len().div_ceil(MOST_TRIPLES).max(1);
+        let within = |pose: &Pose, limit: f64| -> Vec<usize> {
+            self.errors(pose).iter().enumerate().filter(|(_, e)| **e <= limit).map(|(k, _)| k).collect()
+        };
+        let mut best: (Vec<usize>, f64) = (Vec::new(), f64::INFINITY);
+        for t in triples.into_iter().step_by(step) {
+            let some = t.map(|i| known.get(i).copied().unwrap_or(0));
+            let Some((mut pose, _)) = self.of(&some) else { continue };
+            // Three picks put the far end of a part roughly: those near the pose join it, then those that agree stay.
+            for wide in [4.0, 2.0, 1.0] {
+                let agree = within(&pose, wide * limit);
+                match self.of(&agree) {
+                    Some(p) if agree.len() >= 3 => pose = p.0,
+                    _ => break,
+                }
+            }
+            let agree = within(&pose, limit);
+            let cost: f64 = self.errors(&pose).iter().map(|e| e.min(limit).powi(2)).sum();
+            if agree.len() > best.0.len() || (agree.len() == best.0.len() && cost < best.1) {
+                best = (agree, cost);
+            }
+        }
+        best.0
+    }
+}
+
+/// In which way picks contradict each other.
+fn explain(all: &Trial<'_>, known: &[usize], limit_px: f64) -> PickError {
+    let (picked, n) = (all.picked, all.picked.len());
+    let fits = |picks: &[Picked], seen: &[Option<Vec3>]| {
+        let trial = Trial { rig: all.rig, picked: picks, seen };
+        trial.of(known).is_some_and(|f| trial.worst(&f.0) <= limit_px)
+    };
+    if known.len() == n && n > 3 {
+        // Spread in space against spread on the mesh: one number, right if nothing else is wrong.
+        let size = |points: &mut dyn Iterator<Item = Vec3>| {
+            let points: Vec<Vec3> = points.collect();
+            let centre = points.iter().sum::<Vec3>() / n as f64;
+            points.iter().map(|p| (p - centre).norm_squared()).sum::<f64>().sqrt()
+        };
+        let scale =
+            size(&mut all.seen.iter().flatten().copied()) / size(&mut picked.iter().map(|p| p.point)).max(1e-300);
+        let with =
+            |f: &dyn Fn(Vec3) -> Vec3| picked.iter().map(|p| Picked { point: f(p.point), ..*p }).collect::<Vec<_>>();
+        if (scale - 1.0).abs() > OTHER_SIZE && fits(&with(&|p| p * scale), all.seen) {
+            return PickError::Scale(scale);
+        }
+        if fits(&with(&|p| Vec3::new(-p.x, p.y, p.z)), all.seen) {
+            return PickError::Mirrored;
+        }
+        for (i, j) in (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j))).take(MOST_TRIPLES) {
+            let mut picks = picked.to_vec();
+            if let (Some(a), Some(b)) = (picked.get(i), picked.get(j)) {
+                let points = [a.point, b.point];
+                for (k, point) in [(i, points[1]), (j, points[0])] {
+                    if let Some(p) = picks.get_mut(k) {
+                        p.point = point;
+                    }
+                }
+            }
+            if fits(&picks, all.seen) {
+                return PickError::Exchanged(i + 1, j + 1);
             }
         }
     }
-    if !(most <= limit_px) {
-        // One wrong pick pulls the pose to itself and makes others look worse: the one without which the rest agree best is meant.
-        let without = |k: usize| {
-            let rest: Vec<Picked> = picked.iter().enumerate().filter(|(i, _)| *i != k).map(|(_, p)| *p).collect();
-            let pose = solve(rig, &rest).ok()?.0;
-            let rms = rest.iter().flat_map(|p| errors(rig, &pose, p)).map(|e| e * e).sum::<f64>();
-            let own = picked.get(k).map_or(0.0, |p| errors(rig, &pose, p).into_iter().fold(0.0, f64::max));
-            Some((rms, k, own))
-        };
-        let culprit = (0..picked.len()).filter_map(without).min_by(|a, b| a.0.total_cmp(&b.0));
-        let (worst, error_px) = match culprit {
-            Some((_, k, own)) if picked.len() > 4 => (k + 1, own),
-            _ => (worst, most),
-        };
-        return Err(PickError::Outlier { worst, error_px, limit_px });
+    let agree = all.consensus(known, limit_px);
+    if 2 * agree.len() <= n || agree.len() < 3 {
+        return PickError::Contradiction { agree: agree.len(), count: n, limit_px };
     }
-    let dof = (4 * picked.len()).saturating_sub(6).max(1) as f64;
-    let sigma2 = (sum / dof).max(1.0);
-    let covariance = information.try_inverse().ok_or(PickError::Degenerate("they lie on one line"))? * sigma2;
-    Ok(MeshPose { left_from_mesh: pose, rms_px: (sum / (2.0 * picked.len() as f64)).sqrt(), covariance })
+    let Some((pose, _)) = all.of(&agree) else { return PickError::Degenerate("they lie on one line") };
+    let errors = all.errors(&pose);
+    let out: Vec<usize> = (0..n).filter(|k| !agree.contains(k)).collect();
+    let error_px = out.iter().filter_map(|k| errors.get(*k)).copied().fold(0.0, f64::max);
+    match out.as_slice() {
+        // Behind a camera it has no pixel at all.
+        [k] if !error_px.is_finite() => PickError::Behind(k + 1),
+        [k] => PickError::Outlier { worst: k + 1, error_px, limit_px },
+        _ => {
+            let which = out.iter().map(|k| (k + 1).to_string()).collect::<Vec<_>>().join(", ");
+            PickError::Outliers { which, others: agree.len(), error_px, limit_px }
+        }
+    }
 }
 
 /// Distances of a pick's pixels from where a pose puts its point, left and right.
 fn errors(rig: &Rig, pose: &Pose, p: &Picked) -> [f64; 2] {
-    let x = (pose * Point3::from(p.point)).coords;
-    [(View::Left, p.left), (View::Right, p.right)]
-        .map(|(view, px)| rig.project(view, &x).map_or(f64::INFINITY, |q| (q - px).norm()))
+    residuals(rig, pose, p).map(|r| r.map_or(f64::INFINITY, |r| r.norm()))
 }
 
-/// The pose, and the information of a small body motion for pixels of unit noise.
-fn solve(rig: &Rig, picked: &[Picked]) -> Result<(Pose, Matrix6<f64>), PickError> {
-    if picked.len() < 3 {
-        return Err(PickError::TooFew(picked.len()));
-    }
-    if picked
-        .iter()
-        .any(|p| ![p.left.x, p.left.y, p.right.x, p.right.y].iter().chain(p.point.iter()).all(|v| v.is_finite()))
-    {
-        return Err(PickError::Degenerate("a number is not finite"));
-    }
-    let lenses = View::BOTH.map(|v| Lens::new(rig.camera(v)));
-    let seen: Vec<Vec3> = picked
-        .iter()
-        .map(|p| triangulate(rig, &lenses, p))
-        .collect::<Option<_>>()
-        .ok_or(PickError::Degenerate("the two rays of a point do not meet in front of the cameras"))?;
-    let mut pose = align(picked, &seen).ok_or(PickError::Degenerate("they lie on one line"))?;
+/// What a pick's pixels, left and right, differ by from where a pose puts its point; `None` where that is behind the camera.
+pub fn residuals(rig: &Rig, left_from_mesh: &Pose, p: &Picked) -> [Option<Pixel>; 2] {
+    let x = (left_from_mesh * Point3::from(p.point)).coords;
+    [(View::Left, p.left), (View::Right, p.right)].map(|(view, px)| rig.project(view, &x).map(|q| px - q))
+}
+
+/// Least squares on the pixels from a pose near the solution: the pose, and the information of a small body motion for pixels of unit noise.
+fn refine(rig: &Rig, picked: &[Picked], mut pose: Pose) -> Option<(Pose, Matrix6<f64>)> {
+    let cost = |pose: &Pose| -> f64 { picked.iter().flat_map(|p| errors(rig, pose, p)).map(|e| e * e).sum() };
+    let mut now = cost(&pose);
+    let mut damping = 0.0;
     let mut information = Matrix6::zeros();
-    for _ in 0..30 {
+    for _ in 0..40 {
         let (mut a, mut g) = (Matrix6::zeros(), Vector6::zeros());
         for p in picked {
             let x = (pose * Point3::from(p.point)).coords;
             for (view, px) in [(View::Left, p.left), (View::Right, p.right)] {
                 let view_from_left = rig.view_from_left(view);
                 let c = (view_from_left * Point3::from(x)).coords;
-                let Some((q, j)) = rig.camera(view).project_with_jacobian(&c) else { continue };
+                let (q, j) = rig.camera(view).project_with_jacobian(&c)?;
                 let turn = (view_from_left.rotation * pose.rotation).to_rotation_matrix();
                 let r = j * turn.matrix();
                 let m = p.point;
@@ -132,14 +295,35 @@ fn solve(rig: &Rig, picked: &[Picked]) -> Result<(Pose, Matrix6<f64>), PickError
             }
         }
         information = a;
-        let step = a.cholesky().ok_or(PickError::Degenerate("they lie on one line"))?.solve(&g);
-        pose *= exp_twist(&step);
-        pose.rotation.renormalize();
+        let damped = a + Matrix6::from_diagonal(&(a.diagonal() * damping));
+        let step = damped.cholesky()?.solve(&g);
+        let mut next = pose * exp_twist(&step);
+        next.rotation.renormalize();
+        let then = cost(&next);
+        if then <= now || step.norm() < 1e-10 {
+            (pose, now, damping) = (next, then.min(now), damping * 0.1);
+        } else {
+            damping = (10.0f64 * damping).max(1e-4);
+            continue;
+        }
         if step.norm() < 1e-12 {
             break;
         }
     }
-    Ok((pose, information))
+    Some((pose, information))
+}
+
+/// Whether picks spread over more than a line.
+fn spread(picked: &[Picked]) -> bool {
+    let centre = picked.iter().map(|p| p.point).sum::<Vec3>() / picked.len().max(1) as f64;
+    let mut m = Matrix3::zeros();
+    for p in picked {
+        m += (p.point - centre) * (p.point - centre).transpose();
+    }
+    let Some(e) = m.try_symmetric_eigen(1e-14, 100) else { return false };
+    let mut e: [f64; 3] = e.eigenvalues.into();
+    e.sort_by(f64::total_cmp);
+    e[1] > LINE * e[2] && e[2] > 0.0
 }
 
 /// The point nearest to both viewing rays, in the left frame.
@@ -165,17 +349,8 @@ fn align(picked: &[Picked], seen: &[Vec3]) -> Option<Pose> {
     let n = picked.len() as f64;
     let (ca, cb) = (picked.iter().map(|p| p.point).sum::<Vec3>() / n, seen.iter().sum::<Vec3>() / n);
     let mut s = Matrix3::zeros();
-    let mut spread = Matrix3::zeros();
     for (p, q) in picked.iter().zip(seen) {
         s += (p.point - ca) * (q - cb).transpose();
-        spread += (p.point - ca) * (p.point - ca).transpose();
-    }
-    // On one line all but one of the spread's eigenvalues vanish.
-    let e = spread.try_symmetric_eigen(1e-14, 60)?.eigenvalues;
-    let largest = e.max();
-    let second = e.iter().copied().filter(|v| *v < largest).fold(0.0, f64::max);
-    if !(second > 1e-6 * largest) {
-        return None;
     }
     let d = s[(1, 2)] - s[(2, 1)];
     let f = s[(2, 0)] - s[(0, 2)];
@@ -196,75 +371,5 @@ fn align(picked: &[Picked], seen: &[Vec3]) -> Option<Pose> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use graspd_rt::geom::{Camera, Distortion};
-    use rand::SeedableRng;
-    use rand_distr::{Distribution, Normal};
-
-    fn rig() -> Rig {
-        let camera = Camera {
-            width: 1280,
-            height: 1024,
-            fx: 1200.0,
-            fy: 1200.0,
-            cx: 640.0,
-            cy: 512.0,
-            distortion: Distortion { k1: -0.1, ..Default::default() },
-        };
-        let turn = UnitQuaternion::from_scaled_axis(Vec3::new(0.0, 0.32, 0.0));
-        Rig { left: camera, right: camera, right_from_left: Pose::from_parts(Vec3::new(-0.48, 0.0, 0.08).into(), turn) }
-    }
-
-    fn picks(pose: &Pose, sigma: f64, seed: u64) -> Vec<Picked> {
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-        let n = Normal::new(0.0, sigma.max(1e-12)).unwrap();
-        let r = rig();
-        (0..7)
-            .map(|i| {
-                let point = Vec3::from_fn(|k, _| if i >> k & 1 == 1 { 0.05 } else { -0.05 })
-                    + Vec3::new(0.003 * f64::from(i), 0.0, 0.0);
-                let x = (pose * Point3::from(point)).coords;
-                let mut px = |v| r.project(v, &x).unwrap() + Pixel::new(n.sample(&mut rng), n.sample(&mut rng));
-                Picked { point, left: px(View::Left), right: px(View::Right) }
-            })
-            .collect()
-    }
-
-    #[test]
-    fn exact_picks_give_the_pose_and_noisy_ones_its_covariance() {
-        let truth = Pose::new(Vec3::new(0.2, -0.05, 1.4), Vec3::new(0.4, -1.9, 0.7));
-        let exact = fit(&rig(), &picks(&truth, 0.0, 0), 2.0).unwrap();
-        assert!((exact.left_from_mesh.translation.vector - truth.translation.vector).norm() < 1e-9);
-        assert!(exact.left_from_mesh.rotation.angle_to(&truth.rotation) < 1e-9);
-        let mut sum = 0.0;
-        for seed in 0..200 {
-            let f = fit(&rig(), &picks(&truth, 1.0, seed), 10.0).unwrap();
-            let e = graspd_rt::geom::log_pose(&(truth.inverse() * f.left_from_mesh));
-            // The stated covariance never uses less than a pixel of scatter, which is the truth here.
-            sum += (e.transpose() * f.covariance.try_inverse().unwrap() * e)[0];
-        }
-        let mean = sum / 200.0;
-        assert!((4.0..8.0).contains(&mean), "mean squared Mahalanobis distance {mean}, 6 expected");
-    }
-
-    #[test]
-    fn bad_picks_are_refused_in_words() {
-        let truth = Pose::new(Vec3::new(0.2, -0.05, 1.4), Vec3::new(0.4, 0.3, 0.7));
-        let mut p = picks(&truth, 0.0, 0);
-        p[3].left.x += 40.0;
-        assert!(matches!(fit(&rig(), &p, 5.0), Err(PickError::Outlier { worst: 4, .. })));
-        assert_eq!(fit(&rig(), &p[..2], 5.0), Err(PickError::TooFew(2)));
-        let mut line = picks(&truth, 0.0, 0);
-        for (k, q) in line.iter_mut().enumerate() {
-            let point = Vec3::new(0.01 * k as f64, 0.0, 0.0);
-            let x = (truth * Point3::from(point)).coords;
-            *q = Picked {
-                point,
-                left: rig().project(View::Left, &x).unwrap(),
-                right: rig().project(View::Right, &x).unwrap(),
-            };
-        }
-        assert!(matches!(fit(&rig(), &line, 5.0), Err(PickError::Degenerate(_))));
-    }
-}
+#[path = "pose_tests.rs"]
+mod tests;

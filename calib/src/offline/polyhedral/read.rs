@@ -105,7 +105,7 @@ fn parse(bytes: &[u8], kind: &str, unit_m: f64) -> Result<MeshFile, Problem> {
     let mut notes = Vec::new();
     let flat = count - mesh.triangles.len();
     if flat > 0 {
-        notes.push(format!("{flat} of {count} triangles have no area and were left out"));
+        notes.push(format!("{flat} of {count} triangles have no area, or are given twice, and were left out"));
     }
     let Topology { turned, inside_out, open, crowded, one_sided, .. } = topology::mend(&mut mesh);
     if inside_out {
@@ -120,7 +120,9 @@ fn parse(bytes: &[u8], kind: &str, unit_m: f64) -> Result<MeshFile, Problem> {
         ));
     }
     if crowded > 0 {
-        notes.push(format!("{crowded} edges join more than two triangles: flat faces are not followed across them"));
+        notes.push(format!(
+            "{crowded} edges join more than two triangles: the mesh is not the surface of one solid there"
+        ));
     }
     if one_sided > 0 {
         notes.push(format!(

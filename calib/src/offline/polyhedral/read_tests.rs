@@ -162,12 +162,14 @@ fn windings_are_mended_and_doubts_are_told() {
     assert!(outward(&good.mesh) && outward(&mended.mesh) && outward(&turned.mesh));
     let open = parse(&binary(&cube()[..10].to_vec()), "stl", 1e-3).unwrap();
     assert!(open.notes.iter().any(|n| n.contains("4 open edges")), "{:?}", open.notes);
+    // A triangle given twice, one without area, and a fin that stands on an edge.
     let mut double = cube();
     double.push(cube()[0]);
     double.push([[5.0; 3]; 3]);
+    double.push([cube()[0][0], cube()[0][1], [-30.0, 0.0, -30.0]]);
     let notes = parse(&binary(&double), "stl", 1e-3).unwrap().notes;
     assert!(
-        notes.iter().any(|n| n.contains("3 edges join more than two")) && notes.iter().any(|n| n.contains("1 of 14")),
+        notes.iter().any(|n| n.contains("1 edges join more than two")) && notes.iter().any(|n| n.contains("2 of 15")),
         "{notes:?}"
     );
 }
@@ -190,4 +192,32 @@ fn hollow_polygons_are_cut_within_their_outline() {
     }
     let star = "v 0 0 0\nv 3 3 0\nv 3 0 0\nv 0 3.5 0\nf 1 2 3 4\n";
     assert!(obj::read(star.as_bytes()).unwrap_err().reason.contains("crosses itself"));
+}
+
+#[test]
+fn pieces_and_hollows_are_turned_each_for_itself() {
+    let at = |t: Corners, s: f32, d: f32| -> Corners {
+        t.iter().map(|t| t.map(|v| [v[0] * s + d, v[1] * s, v[2] * s])).collect()
+    };
+    let flip = |t: Corners| -> Corners { t.iter().map(|t| [t[0], t[2], t[1]]).collect() };
+    let volume = |t: &Corners| {
+        let m = parse(&binary(t), "stl", 1e-3).unwrap().mesh;
+        (0..m.triangles.len()).map(|t| m.corners(t)).map(|[a, b, c]| a.dot(&b.cross(&c)) / 6.0 * 1e6).sum::<f64>()
+    };
+    // Two cubes of 64 and 8 cm3 side by side, one of them inside out: both count. A hollow of 8 cm3 is taken off, whichever way all of it is wound.
+    let (large, small) = (at(cube(), 1.0, 0.0), at(cube(), 0.5, 60.0));
+    for t in [[large.clone(), flip(small.clone())].concat(), [flip(large.clone()), small].concat()] {
+        assert!((volume(&t) - 72.0).abs() < 1e-3, "{}", volume(&t));
+    }
+    let hollow = [large, flip(at(cube(), 0.5, 0.0))].concat();
+    assert!((volume(&hollow) - 56.0).abs() < 1e-3 && (volume(&flip(hollow)) - 56.0).abs() < 1e-3);
+    // Six faces that share no corner (each a thousandth of a millimetre from the next), every second one wound inwards: still a cube.
+    let mut loose = cube();
+    for (k, t) in loose.iter_mut().enumerate() {
+        *t = t.map(|v| v.map(|x| x * (1.0 + 1e-4 * (k / 2) as f32)));
+        if k / 2 % 2 == 0 {
+            t.swap(1, 2);
+        }
+    }
+    assert!((volume(&loose) - 64.0).abs() < 0.1, "{}", volume(&loose));
 }

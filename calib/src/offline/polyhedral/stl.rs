@@ -15,8 +15,11 @@ pub(super) fn read(bytes: &[u8]) -> Result<Vec<[Vec3; 3]>, Problem> {
     let head = String::from_utf8_lossy(start).to_ascii_lowercase();
     let stated = bytes.get(80..HEAD).and_then(|b| b.try_into().ok()).map(u32::from_le_bytes);
     let fits = stated.is_some_and(|n| bytes.len() == HEAD + EACH * n as usize);
-    if !fits && head.trim_start().starts_with("solid") && (head.contains("facet") || head.contains("endsolid")) {
-        return text(&String::from_utf8_lossy(bytes));
+    if !fits
+        && head.trim_start_matches('\u{feff}').trim_start().starts_with("solid")
+        && (head.contains("facet") || head.contains("endsolid"))
+    {
+        return text(String::from_utf8_lossy(bytes).trim_start_matches('\u{feff}'));
     }
     let Some(count) = stated else {
         return Err(Problem::new(
@@ -58,31 +61,75 @@ pub(super) fn read(bytes: &[u8]) -> Result<Vec<[Vec3; 3]>, Problem> {
     Ok(out)
 }
 
-/// A text STL: one keyword a line.
+/// A text STL: words, wherever its writer broke the lines.
 fn text(text: &str) -> Result<Vec<[Vec3; 3]>, Problem> {
+    // Old programs end lines with a carriage return alone.
+    let lines = text.split(['\n', '\r']);
+    let mut line_no = 0;
+    let mut after_return = false;
+    let mut words: Vec<(usize, &str)> = Vec::new();
+    let mut at = 0;
+    for line in lines {
+        // A carriage return and a line feed together are one end of a line.
+        if !(after_return && line.is_empty()) {
+            line_no += 1;
+        }
+        words.extend(line.split_whitespace().map(|w| (line_no, w)));
+        at += line.len() + 1;
+        after_return = text.as_bytes().get(at - 1) == Some(&b'\r') && text.as_bytes().get(at) == Some(&b'\n');
+    }
+    let is = |k: usize, word: &str| words.get(k).is_some_and(|w| w.1.eq_ignore_ascii_case(word));
+    // A name may be any words, up to the end of its line, or to what can only be the next keyword where all stands on one line.
+    let name_end = |from: usize, line: usize| {
+        let ends = |k: usize| {
+            words.get(k).is_none_or(|w| w.0 != line)
+                || (is(k, "facet") && is(k + 1, "normal"))
+                || (is(k, "endsolid") && k > from)
+        };
+        (from..=words.len()).find(|k| ends(*k)).unwrap_or(words.len())
+    };
     let mut out = Vec::new();
     let mut corners: Vec<Vec3> = Vec::with_capacity(3);
     let (mut in_solid, mut in_facet) = (false, false);
-    let mut last = 0;
-    for (k, line) in text.lines().enumerate() {
-        let line_no = k + 1;
-        last = line_no;
-        let wrong = |what: String| Problem::new(format!("line {line_no}: {what}"), "repair or export the part again");
-        let mut words = line.split_whitespace();
-        let Some(key) = words.next() else { continue };
-        match key.to_ascii_lowercase().as_str() {
-            "solid" if !in_facet => in_solid = true,
+    let mut k = 0;
+    while let Some((line, word)) = words.get(k).copied() {
+        let wrong = |what: String| Problem::new(format!("line {line}: {what}"), "repair or export the part again");
+        k += 1;
+        match word.to_ascii_lowercase().as_str() {
+            "solid" if !in_facet => {
+                in_solid = true;
+                k = name_end(k, line);
+            }
             "endsolid" if in_facet => return Err(wrong("the solid ends inside a facet".to_owned())),
-            "endsolid" => in_solid = false,
+            "endsolid" => {
+                in_solid = false;
+                k = name_end(k, line);
+            }
             "facet" if in_facet => return Err(wrong("a facet begins inside another".to_owned())),
-            "facet" if in_solid => in_facet = true,
-            "outer" | "endloop" if in_facet => {}
-            "vertex" if in_facet => {
-                let xyz: Vec<f64> = words.filter_map(|w| w.parse().ok()).collect();
-                match xyz.as_slice() {
-                    [x, y, z] if xyz.iter().all(|v| v.is_finite()) => corners.push(Vec3::new(*x, *y, *z)),
-                    _ => return Err(wrong(format!("\"{}\" is not a vertex with three finite numbers", line.trim()))),
+            "facet" if in_solid => {
+                in_facet = true;
+                // The normal follows from the corners; what stands here is often wrong or not even a number.
+                if is(k, "normal") {
+                    k += 1;
+                    k += words.iter().skip(k).take(3).take_while(|w| !w.1.eq_ignore_ascii_case("outer")).count();
                 }
+            }
+            "outer" if in_facet && is(k, "loop") => k += 1,
+            "endloop" if in_facet => {}
+            "vertex" if in_facet => {
+                let xyz: Vec<f64> = words.iter().skip(k).take(3).map_while(|w| w.1.parse().ok()).collect();
+                // On its own line nothing else may follow: "1 2 3 4" or "1,5" is somebody else's format.
+                let next = words.get(k + 3);
+                let clean = next.is_none_or(|w| w.0 != line || w.1.chars().all(|c| c.is_ascii_alphabetic()));
+                match xyz.as_slice() {
+                    [x, y, z] if clean && xyz.iter().all(|v| v.is_finite()) => corners.push(Vec3::new(*x, *y, *z)),
+                    _ => {
+                        let said: Vec<&str> =
+                            words.iter().skip(k - 1).take_while(|w| w.0 == line).take(6).map(|w| w.1).collect();
+                        return Err(wrong(format!("\"{}\" is not a vertex with three finite numbers", said.join(" "))));
+                    }
+                }
+                k += 3;
             }
             "endfacet" if in_facet => {
                 match corners.as_slice() {
@@ -92,12 +139,12 @@ fn text(text: &str) -> Result<Vec<[Vec3; 3]>, Problem> {
                 corners.clear();
                 in_facet = false;
             }
-            _ => return Err(wrong(format!("\"{}\" has no place here in a text STL", line.trim()))),
+            _ => return Err(wrong(format!("\"{word}\" has no place here in a text STL"))),
         }
     }
     if in_solid || in_facet {
         return Err(Problem::new(
-            format!("line {last}: it ends inside a {}", if in_facet { "facet" } else { "solid" }),
+            format!("line {line_no}: it ends inside a {}", if in_facet { "facet" } else { "solid" }),
             "the file is cut off: copy or export it again",
         ));
     }

@@ -1,6 +1,8 @@
 //! Which triangles meet at which edge, whether they agree on what is outside, and turning them where they do not.
 
+use super::bvh::Bvh;
 use super::mesh::Mesh;
+use graspd_rt::geom::Vec3;
 
 /// An edge with the one or two triangles that meet there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -59,11 +61,12 @@ fn groups(mesh: &Mesh, mut each: impl FnMut([u32; 2], &[(u32, bool)])) {
     }
 }
 
-/// Turns triangles so that neighbours agree (the fewer of each piece are turned), then the whole mesh if its volume comes out negative.
+/// Turns triangles so that neighbours agree (the fewer of each piece are turned), then every piece that is inside out.
 pub fn mend(mesh: &mut Mesh) -> Topology {
     let mut found = Topology::default();
     let n = mesh.triangles.len();
     let mut near: Vec<Vec<(u32, bool)>> = vec![Vec::new(); n];
+    let mut whole = vec![true; n];
     groups(mesh, |_, sides| match sides {
         [(t, d), (u, e)] => {
             for (x, y) in [(*t, *u), (*u, *t)] {
@@ -72,44 +75,23 @@ pub fn mend(mesh: &mut Mesh) -> Topology {
                 }
             }
         }
-        [_] => found.open += 1,
-        _ => found.crowded += 1,
+        _ => {
+            match sides {
+                [_] => found.open += 1,
+                _ => found.crowded += 1,
+            }
+            for (t, _) in sides {
+                if let Some(w) = whole.get_mut(*t as usize) {
+                    *w = false;
+                }
+            }
+        }
     });
-    // Walk each piece: a triangle that disagrees with the one it was reached from is marked as turned against the piece's first.
-    let mut turn: Vec<Option<bool>> = vec![None; n];
-    for first in 0..n {
-        if turn.get(first).copied().flatten().is_some() {
-            continue;
-        }
-        let mut piece = vec![first];
-        let mut next = 0;
-        if let Some(t) = turn.get_mut(first) {
-            *t = Some(false);
-        }
-        while let Some(t) = piece.get(next).copied() {
-            next += 1;
-            let own = turn.get(t).copied().flatten().unwrap_or(false);
-            for (u, agree) in near.get(t).into_iter().flatten() {
-                // A neighbour that agrees is turned when this one is; one that disagrees when this one is not.
-                let wanted = own == *agree;
-                let u = *u as usize;
-                match turn.get_mut(u) {
-                    Some(slot @ None) => {
-                        *slot = Some(wanted);
-                        piece.push(u);
-                    }
-                    Some(Some(is)) if *is != wanted => found.one_sided += 1,
-                    _ => {}
-                }
-            }
-        }
-        let against = piece.iter().filter(|t| turn.get(**t).copied().flatten() == Some(true)).count();
-        if 2 * against > piece.len() {
-            for t in &piece {
-                if let Some(Some(x)) = turn.get_mut(*t) {
-                    *x = !*x;
-                }
-            }
+    let mut turn = vec![None; n];
+    let mut pieces = Vec::new();
+    for first in 0..n as u32 {
+        if turn.get(first as usize).is_some_and(Option::is_none) {
+            pieces.push(agree(first, &near, &mut turn, &mut found));
         }
     }
     // Each such edge was met from both sides.
@@ -120,21 +102,124 @@ pub fn mend(mesh: &mut Mesh) -> Topology {
             found.turned += 1;
         }
     }
-    if volume(mesh) < 0.0 {
-        for t in &mut mesh.triangles {
+    let inwards = inwards(mesh, &pieces, &whole);
+    found.inside_out = !inwards.is_empty() && inwards.len() == pieces.len();
+    for t in inwards.iter().filter_map(|k| pieces.get(*k)).flatten() {
+        if let Some(t) = mesh.triangles.get_mut(*t as usize) {
             t.swap(1, 2);
         }
-        found.inside_out = true;
+        found.turned += usize::from(!found.inside_out);
     }
     found
 }
 
-/// Volume enclosed (of an open mesh: with its surface's centre for the missing part).
-fn volume(mesh: &Mesh) -> f64 {
+/// Walks a piece from its first triangle and marks which of them have to be turned so that all agree: the fewer ones. Returns the piece.
+fn agree(first: u32, near: &[Vec<(u32, bool)>], turn: &mut [Option<bool>], found: &mut Topology) -> Vec<u32> {
+    let mut piece = vec![first];
+    let mut next = 0;
+    if let Some(t) = turn.get_mut(first as usize) {
+        *t = Some(false);
+    }
+    while let Some(t) = piece.get(next).copied() {
+        next += 1;
+        let own = turn.get(t as usize).copied().flatten().unwrap_or(false);
+        for (u, agree) in near.get(t as usize).into_iter().flatten() {
+            // A neighbour that agrees is turned when this one is; one that disagrees when this one is not.
+            let wanted = own == *agree;
+            match turn.get_mut(*u as usize) {
+                Some(slot @ None) => {
+                    *slot = Some(wanted);
+                    piece.push(*u);
+                }
+                Some(Some(is)) if *is != wanted => found.one_sided += 1,
+                _ => {}
+            }
+        }
+    }
+    let against = piece.iter().filter(|t| turn.get(**t as usize).copied().flatten() == Some(true)).count();
+    if 2 * against > piece.len() {
+        for t in &piece {
+            if let Some(Some(x)) = turn.get_mut(*t as usize) {
+                *x = !*x;
+            }
+        }
+    }
+    piece
+}
+
+/// Pieces of a mesh that are asked for their own inside at most: more are crumbs of a broken file, and only judged together.
+const MOST_PIECES: usize = 3000;
+
+/// Which pieces of a mesh are wound inwards.
+///
+/// A closed piece says so by the sign of its own volume, unless it is a hollow within another one: that goes with the piece round it. A piece
+/// with open edges is a part of a surface that other pieces complete: rays from either side of it count what they meet.
+fn inwards(mesh: &Mesh, pieces: &[Vec<u32>], whole: &[bool]) -> Vec<usize> {
+    let all = |mesh: &Mesh| {
+        if volume(mesh, 0..mesh.triangles.len() as u32) < 0.0 { (0..pieces.len()).collect() } else { Vec::new() }
+    };
+    if pieces.len() == 1 || pieces.len() > MOST_PIECES {
+        return all(mesh);
+    }
+    let tree = Bvh::new(mesh);
+    let mut piece_of = vec![0u32; mesh.triangles.len()];
+    for (k, piece) in pieces.iter().enumerate() {
+        for t in piece {
+            if let Some(p) = piece_of.get_mut(*t as usize) {
+                *p = k as u32;
+            }
+        }
+    }
+    let of = |t: u32| piece_of.get(t as usize).copied().unwrap_or(0);
+    let (mut out, mut hollow, mut outer) = (Vec::new(), Vec::new(), 0usize);
+    for (k, piece) in pieces.iter().enumerate() {
+        let samples = piece.iter().step_by((piece.len() / 9).max(1));
+        let centre = |t: u32| mesh.corners(t as usize).iter().sum::<Vec3>() / 3.0;
+        if piece.iter().all(|t| whole.get(*t as usize).copied().unwrap_or(false)) {
+            // Most of its surface, because pieces of a part may also reach into each other.
+            let (mut within, mut n) = (0, 0);
+            for t in samples {
+                n += 1;
+                within += usize::from(tree.odd(&centre(*t), |u| of(u) as usize != k));
+            }
+            if within == n {
+                hollow.push(k);
+                continue;
+            }
+            outer += 1;
+            if volume(mesh, piece.iter().copied()) < 0.0 {
+                out.push(k);
+            }
+            continue;
+        }
+        outer += 1;
+        let skin = 1e-6 * mesh.size().norm();
+        let (mut inside, mut outside) = (0, 0);
+        for t in samples {
+            let [a, b, c] = mesh.corners(*t as usize);
+            let Some(normal) = (b - a).cross(&(c - a)).try_normalize(0.0) else { continue };
+            // Before the surface and behind it: where the two do not differ, the mesh is no solid there.
+            let [before, behind] = [skin, -skin].map(|s| tree.odd(&(centre(*t) + normal * s), |_| true));
+            inside += usize::from(before && !behind);
+            outside += usize::from(!before && behind);
+        }
+        if inside > outside {
+            out.push(k);
+        }
+    }
+    // A mesh that is inside out as a whole is so in its hollows too.
+    if outer > 0 && out.len() == outer {
+        out.extend(hollow);
+    }
+    out
+}
+
+/// Volume enclosed by some triangles (of an open surface: with the mesh's centre for the missing part).
+fn volume(mesh: &Mesh, of: impl IntoIterator<Item = u32>) -> f64 {
     let c = mesh.centre();
-    (0..mesh.triangles.len())
+    of.into_iter()
         .map(|t| {
-            let [p, q, r] = mesh.corners(t).map(|v| v - c);
+            let [p, q, r] = mesh.corners(t as usize).map(|v| v - c);
             p.dot(&q.cross(&r)) / 6.0
         })
         .sum()

@@ -1,0 +1,238 @@
+//! The one-page report of a plan on a mesh: picture, pose with its doubt, what the picks say, the ellipses of uncertainty, every handle. One file.
+
+use super::filter::Judged;
+use super::plan::{MeshPlan, Placed, Survey};
+use super::pose::{Picked, residuals};
+use crate::files::RigFile;
+use crate::offline::drawing::report::{centre_plot, escape, head, normal_plot, row, tick};
+use graspd_rt::geom::{Pixel, Vec3};
+use nalgebra::{Matrix2, Matrix3};
+use std::fmt::Write;
+
+/// Handles listed at most; a scan of a round part has thousands.
+const MOST_ROWS: usize = 400;
+
+/// The report as HTML; `picture` is the overlay's PNG.
+pub fn html(plan: &MeshPlan, survey: &Survey<'_>, placed: &Placed, rig: &RigFile, picture: Option<&[u8]>) -> String {
+    let o = &plan.file.object;
+    let picture = picture.map(|png| (png, "both views with the part's edges, the way in, gripper and marks"));
+    let mut h = head("Grasp on a mesh", plan.set_point.id, &plan.file.warnings, picture);
+    h += "<div class=two><div><h2>Part</h2><table>";
+    part(&mut h, placed);
+    h += "</table></div><div><h2>Handle</h2><table>";
+    handle(&mut h, plan);
+    h += "</table></div></div>";
+    picks(&mut h, placed, rig);
+    h += "<h2>Uncertainty</h2><small>of the grasp's place and of the approach, from the pose of the part; ellipses that hold the truth with 95 % probability</small><div class=two>";
+    if placed.covariance.is_some() {
+        let centre = Matrix3::from_fn(|i, j| o.covariance_centre_m2[i][j]);
+        let normal = Matrix2::from_fn(|i, j| o.covariance_normal_rad2[i][j]);
+        let _ = write!(h, "<div>{}</div><div>{}</div></div>", centre_plot(&centre), normal_plot(&normal));
+    } else {
+        h += "<div>not known: the pose file states no sigma_mm and sigma_deg</div></div>";
+    }
+    handles(&mut h, plan, survey);
+    h += "</html>\n";
+    h
+}
+
+fn vector(v: &Vec3, scale: f64, digits: usize) -> String {
+    // No minus before a nought that is only rounding error.
+    let least = 0.5 * 10f64.powi(-(digits as i32));
+    let number = |x: &f64| if (x * scale).abs() < least { 0.0 } else { x * scale };
+    v.iter().map(|x| format!("{:.digits$}", number(x))).collect::<Vec<_>>().join(", ")
+}
+
+fn part(h: &mut String, placed: &Placed) {
+    let m = &placed.record;
+    let pose = &placed.left_from_mesh;
+    row(h, "size", &format!("{} mm, {} triangles", vector(&Vec3::from(m.size_m), 1e3, 1), m.triangles));
+    row(h, "unit of the file", &format!("{} mm", m.unit_m * 1e3));
+    row(h, "file", &format!("<code>{}</code>", escape(m.hash.get(..16).unwrap_or(&m.hash))));
+    row(h, "place (left camera)", &format!("{} mm", vector(&pose.translation.vector, 1e3, 2)));
+    row(
+        h,
+        "rotation vector",
+        &format!("{}&deg;", vector(&pose.rotation.scaled_axis(), 180.0 / std::f64::consts::PI, 2)),
+    );
+    if let Some(c) = &placed.covariance {
+        let sd = |k: usize| c[(k, k)].max(0.0).sqrt();
+        let place = Vec3::new(sd(0), sd(1), sd(2));
+        let turn = Vec3::new(sd(3), sd(4), sd(5)) * (180.0 / std::f64::consts::PI);
+        row(
+            h,
+            "its standard deviations",
+            &format!("{} mm; {}&deg;, along and about the mesh's axes", vector(&place, 1e3, 2), vector(&turn, 1.0, 3)),
+        );
+    }
+    let from = match m.rms_px {
+        Some(rms) => format!("{} picked points, rms {rms:.2} px", m.picked.len()),
+        None => "a file".to_owned(),
+    };
+    row(h, "pose from", &from);
+}
+
+fn handle(h: &mut String, plan: &MeshPlan) {
+    let (o, j) = (&plan.file.object, &plan.chosen);
+    row(h, "width", &format!("{:.2} mm, jaws {:.2} mm open on the way in", j.handle.width * 1e3, j.opening * 1e3));
+    row(h, "contact", &format!("{:.0} mm&sup2; a claw", j.contact * 1e6));
+    row(
+        h,
+        "closing, approach (mesh)",
+        &format!("({}), ({})", vector(&j.handle.closing, 1.0, 3), vector(&j.handle.approach, 1.0, 3)),
+    );
+    row(h, "grasp (left camera)", &format!("{} mm", vector(&Vec3::from(o.centre_m), 1e3, 2)));
+    row(
+        h,
+        "its uncertainty (worst)",
+        &format!("{:.2} mm, approach {:.2}&deg; (one &sigma;)", o.sigma_centre_mm, o.sigma_normal_deg),
+    );
+    row(
+        h,
+        "marks",
+        &format!(
+            "{} seen left, {} right ({:.1}, {:.1} &micro;sr), best view {}",
+            j.seen[0],
+            j.seen[1],
+            j.visibility[0] * 1e6,
+            j.visibility[1] * 1e6,
+            escape(&plan.file.best_view)
+        ),
+    );
+    if let Some(p) = &plan.file.path {
+        row(
+            h,
+            "path",
+            &format!(
+                "{:.0} mm, turn {:.0}&deg;; fewest marks seen {} left, {} right",
+                p.length_m * 1e3,
+                p.turn_deg,
+                p.fewest_marks[0],
+                p.fewest_marks[1]
+            ),
+        );
+    }
+}
+
+/// What the picked pixels differ by from where the pose puts their points: a plot a view, and a table.
+fn picks(h: &mut String, placed: &Placed, rig: &RigFile) {
+    let m = &placed.record;
+    let Some(rms) = m.rms_px else { return };
+    let off: Vec<[Option<Pixel>; 2]> = m
+        .picked
+        .iter()
+        .map(|p| {
+            let p =
+                Picked { point: Vec3::from(p.point_m), left: Pixel::from(p.left_px), right: Pixel::from(p.right_px) };
+            residuals(&rig.rig, &placed.left_from_mesh, &p)
+        })
+        .collect();
+    h.push_str("<h2>Picked points</h2><small>picked pixel less where the pose puts the point, pixels; the circle is the rms of a pick</small><div class=two>");
+    for (k, name) in ["left", "right"].iter().enumerate() {
+        let points: Vec<(usize, Pixel)> =
+            off.iter().enumerate().filter_map(|(n, o)| o.get(k).copied().flatten().map(|p| (n + 1, p))).collect();
+        let _ = write!(h, "<div>{}</div>", scatter(name, &points, rms));
+    }
+    h.push_str("</div><table><tr><th>pick<th>point on the mesh, mm<th>left, px<th>off<th>right, px<th>off</tr>");
+    for (n, (p, o)) in m.picked.iter().zip(&off).enumerate() {
+        let px = |p: &[f64; 2]| format!("{:.1}, {:.1}", p[0], p[1]);
+        let by = |o: &Option<Pixel>| o.map_or("behind".to_owned(), |o| format!("{:+.2}, {:+.2}", o.x, o.y));
+        let _ = write!(
+            h,
+            "<tr><td>{}<td>{}<td>{}<td>{}<td>{}<td>{}</tr>",
+            n + 1,
+            vector(&Vec3::from(p.point_m), 1e3, 2),
+            px(&p.left_px),
+            by(&o[0]),
+            px(&p.right_px),
+            by(&o[1])
+        );
+    }
+    h.push_str("</table>");
+}
+
+/// Differences in pixels as numbered dots round a cross; down is down as in the picture.
+fn scatter(name: &str, points: &[(usize, Pixel)], rms: f64) -> String {
+    let (w, h) = (560.0, 300.0);
+    let largest = points.iter().map(|(_, p)| p.x.abs().max(p.y.abs())).fold(1.2 * rms, f64::max).max(0.02) * 1.15;
+    let scale = 0.5 * (h - 40.0) / largest;
+    let (cx, cy) = (0.5 * w, 0.5 * h + 6.0);
+    let mut s = format!(
+        "<svg viewBox=\"0 0 {w} {h}\" role=img aria-label=\"residuals of the picks, {name}\" font-size=12 fill=currentColor>"
+    );
+    let step = tick(2.0 * largest);
+    let n = (largest / step).floor() as i32;
+    for k in -n..=n {
+        let d = f64::from(k) * step * scale;
+        let opacity = if k == 0 { ".6" } else { ".15" };
+        let _ = write!(
+            s,
+            "<path d=\"M{:.1} 20V{:.1}M40 {:.1}H{:.1}\" stroke=currentColor opacity={opacity} />",
+            cx + d,
+            h - 16.0,
+            cy + d,
+            w - 20.0
+        );
+        if k != 0 {
+            let value = f64::from(k) * step;
+            let _ = write!(s, "<text x={:.1} y={:.1} text-anchor=middle>{value:.2}</text>", cx + d, h - 3.0);
+            let _ = write!(s, "<text x=36 y={:.1} text-anchor=end>{value:.2}</text>", cy + d + 4.0);
+        }
+    }
+    let _ = write!(s, "<circle cx={cx} cy={cy} r={:.1} fill=none stroke=#2da44e stroke-width=1.5 />", rms * scale);
+    for (k, p) in points {
+        let (x, y) = (cx + p.x * scale, cy + p.y * scale);
+        let _ = write!(
+            s,
+            "<circle cx={x:.1} cy={y:.1} r=3 fill=#0969da /><text x={:.1} y={:.1}>{k}</text>",
+            x + 5.0,
+            y - 4.0
+        );
+    }
+    let _ = write!(s, "<text x=44 y=14 font-weight=600>{name}: u right, v down, px</text></svg>");
+    s
+}
+
+/// Every handle with its verdict, and how many were dropped for which kind of reason.
+fn handles(h: &mut String, plan: &MeshPlan, survey: &Survey<'_>) {
+    let all = &survey.handles;
+    let mut kinds = std::collections::BTreeMap::<&str, usize>::new();
+    for j in all {
+        *kinds.entry(j.reason.as_ref().map_or("can be taken", |r| r.kind())).or_default() += 1;
+    }
+    let counts = kinds.iter().map(|(k, n)| format!("{n} {k}")).collect::<Vec<_>>().join(", ");
+    let _ = write!(
+        h,
+        "<h2>Handles</h2><small>{} on {} flat faces, best first: {counts}; closing and approach in the mesh's frame</small>\
+         <table><tr><th>N<th>width<th>closing<th>approach<th>contact<th>marks left, right<th>visibility<th>verdict</tr>",
+        all.len(),
+        survey.faces
+    );
+    let chosen = |j: &Judged| j == &plan.chosen;
+    for (k, j) in all.iter().enumerate().take(MOST_ROWS) {
+        let (open, close) = if chosen(j) { ("<b>", "</b>") } else { ("", "") };
+        let verdict = match &j.reason {
+            None if chosen(j) => "chosen".to_owned(),
+            None => "possible".to_owned(),
+            Some(r) => format!("dropped: {r}"),
+        };
+        let _ = write!(
+            h,
+            "<tr><td>{open}{}{close}<td>{:.1} mm<td>{}<td>{}<td>{:.0} mm&sup2;<td>{}, {}<td>{:.1}, {:.1} &micro;sr<td>{open}{}{close}</tr>",
+            k + 1,
+            j.handle.width * 1e3,
+            vector(&j.handle.closing, 1.0, 2),
+            vector(&j.handle.approach, 1.0, 2),
+            j.contact * 1e6,
+            j.seen[0],
+            j.seen[1],
+            j.visibility[0] * 1e6,
+            j.visibility[1] * 1e6,
+            escape(&verdict)
+        );
+    }
+    h.push_str("</table>");
+    if all.len() > MOST_ROWS {
+        let _ = write!(h, "<small>{} more are not shown; --list shows all</small>", all.len() - MOST_ROWS);
+    }
+}
