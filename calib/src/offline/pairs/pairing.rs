@@ -136,7 +136,8 @@ fn bars(
     let start = (r.rim.centre, r.rim.normal, (r.rim.a * r.rim.b).sqrt());
     let found = search::find(views, clicked, start, p, options, most);
     let mut out: Vec<(f64, BarFound)> = found.found.into_iter().map(|b| (b.evidence(p, options), b)).collect();
-    out.sort_by(|a, b| b.0.total_cmp(&a.0));
+    // Of two bars the one whose outlines are the more complete and keep to it the closer: their evidences are about different edges.
+    out.sort_by(|a, b| a.1.doubt().total_cmp(&b.1.doubt()));
     (out, found.support, found.excess)
 }
 
