@@ -1,7 +1,7 @@
 //! A bar that was found, and by how much its outlines are those of a bar rather than the edges of something flat.
 
 use crate::offline::conic::robust::{GATE, median};
-use crate::offline::contour::{Contour, LEAST_COVERAGE};
+use crate::offline::contour::Contour;
 use crate::offline::rim::model::{EdgePoint, Options, Outline, Projection, Reconstruction, RimChoice, RimModel};
 use crate::offline::rim::reconstruct::reconstruct;
 
@@ -12,6 +12,9 @@ const MOST_SCATTER_PX: f64 = 0.45;
 /// The fewer edges an outline has, the closer they have to keep to it: what may leave it, pixels, for a share of next to none, and more for each share.
 const SCATTER_AT_NONE: f64 = 0.1;
 const SCATTER_PER_PART: f64 = 0.75;
+/// Least part of each outline that has to keep to the bar. What a small wheel's hub and spokes leave of an inner outline is little, and enough where the three
+/// others are there.
+const LEAST_PART: f64 = 0.15;
 /// Most scatter about the fitted bar in units of the edges' own uncertainty.
 const MOST_NOISE: f64 = 2.2;
 
@@ -74,7 +77,7 @@ impl BarFound {
         let (used, all) = r.inliers.iter().flatten().fold((0, 0), |(u, n), k| (u + usize::from(*k), n + 1));
         let (scatter, part) = self.kept();
         let limit = MOST_SCATTER_PX.min(SCATTER_AT_NONE + SCATTER_PER_PART * part);
-        scatter <= limit && part >= LEAST_COVERAGE && r.noise <= MOST_NOISE && used * 10 >= all * 7
+        scatter <= limit && part >= LEAST_PART && r.noise <= MOST_NOISE && used * 10 >= all * 7
     }
 
     /// By how much the information criterion of two plane rims, one an outline, exceeds that of the bar on the same points: positive for a bar.

@@ -10,6 +10,7 @@ pub(in crate::offline) mod quick_fit;
 pub mod select;
 mod through;
 
+use crate::offline::conic::robust::median;
 use crate::offline::contour::grow::Trial;
 use crate::offline::contour::quick_fit::{Sums, Turn, Walk};
 use crate::offline::edges::arcs::Arcs;
@@ -30,6 +31,10 @@ pub(in crate::offline) const FLOOR_PX: f64 = 0.03;
 const MOST_SCATTER_PX: f64 = 0.9;
 /// Contours that are remembered: a selection has a handful of candidates, and the next one has others.
 const MOST_KEPT: usize = 16;
+/// Edges told apart from their neighbours have to scatter by this much more than before, and by this much more than they say, for the telling apart to be
+/// taken for the cause.
+const SCATTERED_BY: f64 = 1.4;
+const BEYOND: f64 = 2.0;
 /// Smallest part of an ellipse that has to carry edges.
 pub(in crate::offline) const LEAST_COVERAGE: f64 = 0.25;
 
@@ -275,7 +280,18 @@ impl<'a> ViewEdges<'a> {
             return c.clone();
         }
         let bins = ((w.perimeter() / INDEPENDENT_PX) as usize).clamp(12, 4000);
-        points_on_one_ellipse(points, c.ellipse, c.bright_inside, bins, rejected).unwrap_or_else(|| c.clone())
+        let Some(sharp) = points_on_one_ellipse(points, c.ellipse, c.bright_inside, bins, rejected) else {
+            return c.clone();
+        };
+        // Where edges are no blurred steps (a real lens, texture beside the rim, a picture that was sharpened or compressed) taking them apart scatters them, by
+        // more than it says. What it moves them by is then doubt, and no correction.
+        let says = median(sharp.points.iter().map(|p| p.edge.sigma).collect());
+        if sharp.rms_px > SCATTERED_BY * c.rms_px && sharp.rms_px > BEYOND * says {
+            let mut plain = c.clone();
+            plain.points.iter_mut().for_each(|p| p.edge.sigma = p.edge.sigma.hypot(sharp.rms_px));
+            return plain;
+        }
+        sharp
     }
 }
 

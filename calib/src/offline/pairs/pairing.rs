@@ -190,6 +190,22 @@ fn is_clean_circle(r: &Reconstruction) -> bool {
     r.model == RimModel::Circle && r.report.chi2 / r.report.dof.max(1) as f64 <= CLEAN
 }
 
+/// Whether an ellipse's contours are the outer outlines of a bar as well as they are a plane curve's: a torus and an ellipse are told apart by their other
+/// outline, or not at all.
+fn may_be_a_bar(best: &Pair, p: [&Projection; 2], options: &Options) -> bool {
+    let plane = &best.reconstruction;
+    if plane.model != RimModel::Ellipse {
+        return false;
+    }
+    let [l, r] = [0, 1].map(|k| best.contours[k].edge_points(Outline::Outer));
+    let bar = Options { rim: RimChoice::RoundBar, ..*options };
+    let Ok(bar) = reconstruct(&l, p[0], &r, p[1], &bar) else { return false };
+    let noise = bar.report.noise.min(plane.report.noise);
+    let worse = (bar.report.chi2 - plane.report.chi2) / (noise * noise);
+    let apart = bar.rim.normal.angle(&plane.rim.normal).to_degrees();
+    bar.bar_radius.is_some_and(|b| b >= THINNEST * bar.rim.a) && apart > SAME_DEG && worse < DECISIVE
+}
+
 fn ambiguous() -> Result<Pair, Unpaired> {
     Err(Unpaired { refusal: Refusal::RimAmbiguous, swapped_fits: false })
 }
@@ -231,6 +247,7 @@ fn likeliest(
         }
     }
     let best = accepted.into_iter().min_by(|a, b| a.0.total_cmp(&b.0));
+    let mut flat_beyond_doubt = false;
     if options.rim == RimChoice::Auto {
         let likely: Vec<usize> = match &best {
             Some((_, tried, _)) => vec![*tried],
@@ -253,6 +270,7 @@ fn likeliest(
                     }
                 }
             }
+            flat_beyond_doubt |= decided;
             // A second outline that cannot be followed, and a first one that is no clean circle: nobody knows.
             if best.is_some() && !decided && !clean && excess > search::SUPPORTED {
                 return ambiguous();
@@ -260,6 +278,9 @@ fn likeliest(
         }
     }
     if let Some((_, _, best)) = best {
+        if options.rim == RimChoice::Auto && !flat_beyond_doubt && may_be_a_bar(&best, p, options) {
+            return ambiguous();
+        }
         return Ok(best);
     }
     let swapped_fits = order.iter().take(4).any(|(_, l, r)| {
