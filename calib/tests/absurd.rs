@@ -57,6 +57,30 @@ fn a_thousand_well_posed_scenes_are_all_answered_and_right() {
 }
 
 #[test]
+fn a_round_rim_between_the_cameras_is_no_ellipse_before_them() {
+    let mut r = Random::new(14);
+    let (mut asked, mut answered) = (0, 0);
+    while asked < 300 {
+        // A wide rig that looks inwards, and a thin ring whose plane passes between the cameras.
+        let p = rig(r.uniform(1.0, 2.4), 1200.0, 1.5);
+        let x = Vector3::new(r.uniform(-0.05, 0.05), r.uniform(-0.05, 0.05), r.uniform(1.3, 1.7));
+        let rim = rim_tilted(x, r.uniform(1.2, 1.57), r.uniform(-0.4, 0.4), 0.075, 0.075);
+        let side =
+            p.map(|q| (graspd_calib::offline::rim::cone::camera_centre(&q).unwrap() - x).normalize().dot(&rim.normal));
+        if !(side[0] * side[1] < 0.0 && side.iter().all(|s| s.abs() > 0.15)) {
+            continue;
+        }
+        asked += 1;
+        let (l, q) = (seen(&p[0], &rim, 120, 1.0, &mut r), seen(&p[1], &rim, 120, 1.0, &mut r));
+        answered += usize::from(
+            reconstruct(&l, &p[0], &q, &p[1], &Options { rim: RimChoice::Auto, ..Options::default() }).is_ok(),
+        );
+    }
+    println!("{answered} of {asked} answered");
+    assert!(answered * 100 <= asked, "{answered} of {asked}");
+}
+
+#[test]
 fn absurd_selections_pass_less_than_once_in_a_thousand() {
     // Ten thousand in release; fewer without optimisation, to keep the suite's time.
     let trials = if cfg!(debug_assertions) { 2_000 } else { 10_000 };

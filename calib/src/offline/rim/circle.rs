@@ -94,18 +94,31 @@ pub fn extract(cones: &ConePair, pair: PlanePair, both: bool) -> Result<ClosedFo
     Ok(ClosedForm { rim, plane: world, other_plane: cones.plane(&pair.planes[1 - k]), pair })
 }
 
+/// The rim in the plane that was not taken, the one between the cameras: where it is round, they look at opposite faces (errata B6, C4).
+pub(crate) fn between_cameras(cones: &ConePair, pair: &PlanePair) -> Option<Rim> {
+    let k = select(pair, cones).ok()?;
+    let plane = face(pair.planes.get(1 - k)?, &cones.o[0])?;
+    cut(cones, &cones.q, &plane)
+}
+
 /// Checks that a whole rim is in front of both cameras and seen from its face.
 pub fn check_front(rim: &Rim, p: [&Projection; 2], centres: &[Vector3<f64>; 2]) -> Result<(), Refusal> {
+    check_depth(rim, p)?;
+    let side = [0, 1].map(|k| (centres[k] - rim.centre).dot(&rim.normal));
+    if !(side[0] > 0.0 && side[1] > 0.0) {
+        return Err(Refusal::OppositeSides { why: "the fitted plane passes between the cameras" });
+    }
+    Ok(())
+}
+
+/// Checks that a whole rim is in front of both cameras.
+pub(crate) fn check_depth(rim: &Rim, p: [&Projection; 2]) -> Result<(), Refusal> {
     for (k, view) in View::BOTH.into_iter().enumerate() {
         let d = third_row(p[k]).normalize();
         let reach = (rim.a * d.dot(&rim.axis_a)).hypot(rim.b * d.dot(&rim.axis_b));
         if !(depth(p[k], &rim.centre) > reach) {
             return Err(Refusal::Behind { view });
         }
-    }
-    let side = [0, 1].map(|k| (centres[k] - rim.centre).dot(&rim.normal));
-    if !(side[0] > 0.0 && side[1] > 0.0) {
-        return Err(Refusal::OppositeSides { why: "the fitted plane passes between the cameras" });
     }
     Ok(())
 }

@@ -6,7 +6,7 @@ use crate::offline::conic::robust::{self, RobustFit};
 use crate::offline::conic::sampson::Cloud;
 use crate::offline::conic::{FitError, fit_ml};
 use crate::offline::pairs::correspondence::{excess_limit, gaps_with_sigma};
-use crate::offline::rim::circle::{ClosedForm, check_front, extract};
+use crate::offline::rim::circle::{ClosedForm, between_cameras, check_depth, check_front, extract};
 use crate::offline::rim::cone::{ConePair, check_cameras};
 use crate::offline::rim::ml::{MlFit, TwoViews};
 use crate::offline::rim::model::{EdgePoint, Noise, Options, Projection, Rim, RimModel};
@@ -18,6 +18,9 @@ use nalgebra::Vector3;
 
 /// Noise below this many pixels is rounding of the input, not noise.
 const NOISE_FLOOR_PX: f64 = 1e-4;
+
+/// Axis ratio from which an ellipse is nearly a circle.
+const NEARLY_ROUND: f64 = 0.97;
 
 /// Everything that the plane-conic chain found.
 #[derive(Clone, Debug)]
@@ -44,6 +47,8 @@ pub struct Analysis {
     pub ellipse: Result<MlFit, Refusal>,
     /// Maximum-likelihood circle.
     pub circle: Result<MlFit, Refusal>,
+    /// Chi-squared of the circle in the plane between the cameras, where the ellipse in the other plane is no circle.
+    pub between: Option<f64>,
     /// Two-view excess over the one-view fits, in units of the noise variance.
     pub excess: f64,
     /// Its limit at the gate.
@@ -126,6 +131,7 @@ pub fn analyse(points: [&[EdgePoint]; 2], p: [&Projection; 2], options: &Options
     });
     let views = TwoViews::new(clouds, p);
     let (ellipse, circle) = refine(&views, &paper, &polar, p, &centres);
+    let between = between(&views, &ellipse, &polar, &cones, p);
     let single = fits[0].fit.chi2 + fits[1].fit.chi2;
     let two = ellipse.as_ref().or(circle.as_ref()).map_or(f64::INFINITY, |f| f.chi2);
     let excess = ((two - single) / (noise * noise)).max(0.0);
@@ -143,6 +149,7 @@ pub fn analyse(points: [&[EdgePoint]; 2], p: [&Projection; 2], options: &Options
         polar,
         ellipse,
         circle,
+        between,
         excess,
         excess_limit: limit,
         verdict: Ok(()),
@@ -209,12 +216,32 @@ fn refine(
     if let Ok(fit) = &ellipse {
         round.insert(0, fit.rim);
         // A start at the ellipse's minimum is enough when the ellipse is nearly a circle.
-        if fit.rim.b > 0.97 * fit.rim.a {
+        if fit.rim.b > NEARLY_ROUND * fit.rim.a {
             round.truncate(1);
         }
     }
     let circle = best(views, &round, RimModel::Circle, p, centres);
     (ellipse, circle)
+}
+
+/// A circle is the rarer of the two by far: where the plane between the cameras carries one and the plane before them does not, they look at opposite faces
+/// of something thin.
+fn between(
+    views: &TwoViews,
+    ellipse: &Result<MlFit, Refusal>,
+    polar: &Result<ClosedForm, Refusal>,
+    cones: &ConePair,
+    p: [&Projection; 2],
+) -> Option<f64> {
+    if ellipse.as_ref().is_ok_and(|e| e.rim.b > NEARLY_ROUND * e.rim.a) {
+        return None;
+    }
+    let start = between_cameras(cones, &polar.as_ref().ok()?.pair)?;
+    if check_depth(&start, p).is_err() || start.b < 0.8 * start.a {
+        return None;
+    }
+    let r = (start.a * start.b).sqrt();
+    views.fit(&Rim { a: r, b: r, ..start }, RimModel::Circle).ok().map(|f| f.chi2)
 }
 
 /// The lowest admissible minimum over some starts.

@@ -13,6 +13,8 @@ use crate::offline::rim::refusal::Refusal;
 
 /// Limit of the centre's standard deviation as a fraction of the radius when the task states none.
 const CENTRE_FRACTION: f64 = 0.1;
+/// Chi-squared by which a circle may fit worse than an ellipse with its two more parameters (four standard deviations for two degrees of freedom).
+const BETWEEN: f64 = 19.4;
 
 /// Reconstructs a rim from the edge points of both views.
 ///
@@ -165,6 +167,14 @@ pub fn choose_plane_model(a: &Analysis, rim: RimChoice, options: &Options) -> Re
         (_, Err(_), e) => e.map_err(Clone::clone)?,
     };
     let noise = noise_of(fit, a, options);
+    // As good a circle between the cameras with two parameters less, or a better one than the circle before them.
+    let margin = if fit.model == RimModel::Ellipse { BETWEEN } else { -BETWEEN };
+    let yardstick = noise_of(a.ellipse.as_ref().unwrap_or(fit), a, options);
+    if a.between.is_some_and(|chi2| chi2 < fit.chi2 + margin * yardstick * yardstick) {
+        return Err(Refusal::OppositeSides {
+            why: "the plane between the cameras carries a circle there, the one before them none",
+        });
+    }
     tolerable(
         fit.cov_centre(noise).trace().sqrt(),
         fit.cov_normal(noise).trace().sqrt(),
