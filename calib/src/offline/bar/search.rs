@@ -42,7 +42,7 @@ const KNOTS: usize = 5;
 /// Scatter (pixels), support and noise (in the edges' own) of a bar that makes further guesses needless.
 const PLAIN: (f64, f64, f64) = (0.3, 1.1, 1.4);
 /// Guesses followed up.
-pub(in crate::offline) const GUESSES: usize = 3;
+const GUESSES: usize = 3;
 
 /// A thickness that both views support.
 #[derive(Clone, Copy, Debug)]
@@ -57,9 +57,6 @@ struct Guess {
     excess: f64,
 }
 
-/// A guess that is this likely, in parts of the likeliest, is followed up as well: a bright bar's shading may be the equal of its outline.
-const AS_LIKELY: f64 = 0.85;
-
 /// Looks for the bar whose outline was clicked. `plane` is what the contours are a picture of if they are a plane rim; with the bar's diameter known only that is tried.
 pub(in crate::offline) fn find(
     views: [&ViewEdges<'_>; 2],
@@ -67,17 +64,11 @@ pub(in crate::offline) fn find(
     plane: (Vector3<f64>, Vector3<f64>, f64),
     p: [&Projection; 2],
     options: &Options,
-    most: usize,
 ) -> Search {
     let mut search = Search { found: Vec::new(), support: 0.0, excess: 0.0 };
     let Some(eyes) = camera_centre(p[0]).zip(camera_centre(p[1])) else { return search };
     let views = [View::new(views[0], clicked[0], p[0], eyes.0), View::new(views[1], clicked[1], p[1], eyes.1)];
-    let guesses = guesses(&views, clicked, plane, options);
-    let likeliest = guesses.first().map_or(0.0, |g| g.likely);
-    for (k, g) in guesses.into_iter().enumerate() {
-        if k >= most && g.likely < AS_LIKELY * likeliest {
-            break;
-        }
+    for g in guesses(&views, clicked, plane, options) {
         search.support = search.support.max(g.worth);
         search.excess = search.excess.max(g.excess);
         let Some(bar) = settle(&views, g.torus, g.worth, options) else { continue };

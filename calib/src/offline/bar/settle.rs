@@ -23,6 +23,8 @@ const OUTWARD_STEP: f64 = 0.75;
 const OUTWARD_STEPS: i32 = 8;
 /// Part of the found outline's edges that a thicker bar's has to have.
 const AS_GOOD: f64 = 0.7;
+/// What a limb's place is worth where its falling off is not seen undisturbed, pixels.
+const SPOILT_PX: f64 = 0.25;
 /// Corners of a predicted outline.
 const CORNERS: usize = 720;
 
@@ -46,7 +48,7 @@ pub(in crate::offline::bar) fn settle(
         }
         torus = thicker;
     }
-    follow(views, torus, support, options)
+    follow(views, torus, support, options, false).or_else(|| follow(views, torus, support, options, true))
 }
 
 /// Fits the bar to the likeliest edges beside its outlines, again and again in narrowing windows.
@@ -118,7 +120,15 @@ fn outward(views: &[View<'_, '_>; 2], torus: &Torus) -> Option<Torus> {
 }
 
 /// Follows the four outlines of a bar, tells their edges from their neighbours, and fits the bar to them.
-fn follow(views: &[View<'_, '_>; 2], start: Torus, support: f64, options: &Options) -> Option<BarFound> {
+///
+/// `spoilt` lets edges count whose falling off is disturbed by something else beside the limb (paint, a spoke): as edges like others, known less well.
+fn follow(
+    views: &[View<'_, '_>; 2],
+    start: Torus,
+    support: f64,
+    options: &Options,
+    spoilt: bool,
+) -> Option<BarFound> {
     let bar = Options { rim: RimChoice::RoundBar, ..*options };
     let mut torus = start;
     let mut last = None;
@@ -129,7 +139,10 @@ fn follow(views: &[View<'_, '_>; 2], start: Torus, support: f64, options: &Optio
             let limb = Limb::new(blur, torus.bar / v.pixel_at(&torus.centre));
             // Away from the bar is out of the outer outline, and into the inner one.
             let finish = |r: &Refined, out: Pixel| match &limb {
-                Some(l) => l.place(v.edges.picture, r, out, noise, blur),
+                Some(l) => l.place(v.edges.picture, r, out, noise, blur).or_else(|| {
+                    let r = if spoilt { sharpen(v.edges.picture, r, noise, blur)? } else { return None };
+                    Some(Refined { sigma: r.sigma.hypot(SPOILT_PX), ..r })
+                }),
                 None => sharpen(v.edges.picture, r, noise, blur),
             };
             let inwards = |r: &Refined, out: Pixel| finish(r, -out);
