@@ -15,8 +15,6 @@ const SCATTER_PER_PART: f64 = 0.75;
 /// Least part of each outline that has to keep to the bar. What a small wheel's hub and spokes leave of an inner outline is little, and enough where the three
 /// others are there.
 const LEAST_PART: f64 = 0.15;
-/// Edges that are known better than this count alike, pixels.
-const SURE_PX: f64 = 0.1;
 /// Most scatter about the fitted bar in units of the edges' own uncertainty.
 const MOST_NOISE: f64 = 2.2;
 
@@ -43,16 +41,12 @@ impl BarFound {
         for view in 0..2 {
             let mut next = r.residuals[view].iter().zip(&r.inliers[view]);
             for c in [&self.outer[view], &self.inner[view]] {
-                let (mut sum, mut weight, mut n) = (0.0, 0.0, 0usize);
-                for ((d, used), p) in next.by_ref().take(c.points.len()).zip(&c.points) {
-                    if *used {
-                        let w = 1.0 / (p.edge.sigma.powi(2) + SURE_PX * SURE_PX);
-                        sum += w * d * d;
-                        weight += w;
-                        n += 1;
-                    }
+                let (mut sum, mut n) = (0.0, 0usize);
+                for (d, _) in next.by_ref().take(c.points.len()).filter(|(_, used)| **used) {
+                    sum += d * d;
+                    n += 1;
                 }
-                scatter = f64::max(scatter, (sum / f64::max(weight, 1e-12)).sqrt());
+                scatter = f64::max(scatter, (sum / n.max(1) as f64).sqrt());
                 part = f64::min(part, c.coverage * n as f64 / c.points.len().max(1) as f64);
             }
         }

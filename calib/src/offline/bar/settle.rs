@@ -122,13 +122,7 @@ fn outward(views: &[View<'_, '_>; 2], torus: &Torus) -> Option<Torus> {
 /// Follows the four outlines of a bar, tells their edges from their neighbours, and fits the bar to them.
 ///
 /// `spoilt` lets edges count whose falling off is disturbed by something else beside the limb (paint, a spoke): as edges like others, known less well.
-fn follow(
-    views: &[View<'_, '_>; 2],
-    start: Torus,
-    support: f64,
-    options: &Options,
-    spoilt: bool,
-) -> Option<BarFound> {
+fn follow(views: &[View<'_, '_>; 2], start: Torus, support: f64, options: &Options, spoilt: bool) -> Option<BarFound> {
     let bar = Options { rim: RimChoice::RoundBar, ..*options };
     let mut torus = start;
     let mut last = None;

@@ -10,7 +10,7 @@ use crate::offline::bar::search;
 use crate::offline::contour::select::Candidate;
 use crate::offline::contour::{Contour, ViewEdges};
 use crate::offline::rim::model::{Options, Outline, Projection, Reconstruction, RimChoice, RimModel};
-use crate::offline::rim::reconstruct::{reconstruct, tolerable};
+use crate::offline::rim::reconstruct::{bar_alone, cut_off, reconstruct, tolerable};
 use crate::offline::rim::refusal::Refusal;
 use crate::offline::rim::systematic::{Stretch, widen};
 
@@ -86,6 +86,11 @@ fn sharpened(
         let (gap_px, gap_sigma_px) = (r.gap_px, r.gap_sigma_px);
         return Err(Refusal::Mismatch { gap_px, gap_sigma_px, excess: r.excess, limit, delta: r.delta });
     }
+    // A gap that nobody knows closes on anything.
+    let loosest = r.gap_sigma_px.into_iter().filter(|s| s.is_finite()).fold(0.0, f64::max);
+    if loosest > LOOSE_PX {
+        return Err(Refusal::Loose { gap_sigma_px: loosest, limit_px: LOOSE_PX });
+    }
     Ok(Pair { contours, inner: [None, None], reconstruction, tried: 0 })
 }
 
@@ -111,6 +116,13 @@ const DECISIVE: f64 = 60.0;
 
 /// Chi-squared per degree of freedom up to which a circle is clean.
 const CLEAN: f64 = 1.6;
+
+/// Uncertainty of the epipolar tangents, pixels, above which two arcs cannot be held against each other. Whole rims are at a hundredth, ones hidden by a third at a
+/// third of it.
+const LOOSE_PX: f64 = 0.9;
+
+/// Chi-squared by which a bar has to fit better than a circle, one parameter more allowed for.
+const BETTER: f64 = 20.0;
 
 /// Normals closer than this do not need to be decided between, degrees.
 const SAME_DEG: f64 = 0.3;
@@ -189,20 +201,18 @@ fn is_clean_circle(r: &Reconstruction) -> bool {
     r.model == RimModel::Circle && r.report.chi2 / r.report.dof.max(1) as f64 <= CLEAN
 }
 
-/// Whether an ellipse's contours are the outer outlines of a bar as well as they are a plane curve's: a torus and an ellipse are told apart by their other
-/// outline, or not at all.
+/// Whether a plane rim's contours are the outer outlines of a bar as well: a torus and an ellipse are told apart by their other outline, or not at all. A circle
+/// is nothing that a bar's outlines look like by chance, unless the bar fits them better.
 fn may_be_a_bar(best: &Pair, p: [&Projection; 2], options: &Options) -> bool {
     let plane = &best.reconstruction;
-    if plane.model != RimModel::Ellipse {
-        return false;
-    }
-    let [l, r] = [0, 1].map(|k| best.contours[k].edge_points(Outline::Outer));
-    let bar = Options { rim: RimChoice::RoundBar, ..*options };
-    let Ok(bar) = reconstruct(&l, p[0], &r, p[1], &bar) else { return false };
-    let noise = bar.report.noise.min(plane.report.noise);
-    let worse = (bar.report.chi2 - plane.report.chi2) / (noise * noise);
-    let apart = bar.rim.normal.angle(&plane.rim.normal).to_degrees();
-    bar.bar_radius.is_some_and(|b| b >= THINNEST * bar.rim.a) && apart > SAME_DEG && worse < DECISIVE
+    let points = [0, 1].map(|k| best.contours[k].edge_points(Outline::Outer));
+    let points = [points[0].as_slice(), points[1].as_slice()];
+    let noise = plane.report.noise.max(1.0);
+    let Some((bar, chi2)) = bar_alone(points, p, noise, options) else { return false };
+    let worse = (chi2 - cut_off(plane, points, noise)) / (noise * noise);
+    let limit = if plane.model == RimModel::Ellipse { DECISIVE } else { -BETTER };
+    let apart = bar.normal.cross(&plane.rim.normal).norm().asin().to_degrees();
+    bar.bar >= THINNEST * bar.core && apart > SAME_DEG && worse < limit
 }
 
 fn ambiguous() -> Result<Pair, Unpaired> {

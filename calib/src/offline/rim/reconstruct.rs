@@ -1,5 +1,6 @@
 //! From edge points in two views to a rim in space: the chain of section 4, refined, with the model chosen and the doubts spelt out.
 
+use crate::offline::bar::torus::Torus;
 use crate::offline::bar::{bar_result, fit_bar};
 use crate::offline::conic::robust::GATE;
 use crate::offline::conic::sampson::distance;
@@ -43,6 +44,24 @@ pub fn reconstruct(
         }
         RimChoice::Auto => any_model(&analysis, points, p, options),
     }
+}
+
+/// The bar that fits contours as outer outlines, however well they determine it, and its sum of squares with residuals cut off at the gate of a noise.
+pub(crate) fn bar_alone(
+    points: [&[EdgePoint]; 2],
+    p: [&Projection; 2],
+    noise: f64,
+    options: &Options,
+) -> Option<(Torus, f64)> {
+    let analysis = analyse(points, p, options).ok()?;
+    let bar = fit_bar(points, p, &analysis, options).ok()?;
+    let chi2 = truncated(&scaled(&bar.residuals, points, |_| true), noise);
+    Some((bar.fit.torus, chi2))
+}
+
+/// The same sum for a reconstruction of the same points.
+pub(crate) fn cut_off(r: &Reconstruction, points: [&[EdgePoint]; 2], noise: f64) -> f64 {
+    truncated(&scaled(&r.report.residuals, points, |_| true), noise)
 }
 
 /// The plane models alone.

@@ -96,6 +96,16 @@ pub enum Refusal {
         /// The paper's condition, scale-free.
         delta: f64,
     },
+    /// What is seen of the contours is too little to tell whether they belong together.
+    #[error(
+        "too little is seen of one contour to hold it against the other: its epipolar tangents are known to {gap_sigma_px:.2} px only (limit {limit_px:.2}): click more of the rim, or a rim that is less hidden"
+    )]
+    Loose {
+        /// The larger standard deviation of the tangency gaps.
+        gap_sigma_px: f64,
+        /// Its limit.
+        limit_px: f64,
+    },
     /// The pencil of the cones has no real pair of planes.
     #[error(
         "the two viewing cones have no real pair of planes in common ({why}): click the same contour in both pictures, or move the rig off the rim's axis"
