@@ -114,7 +114,7 @@ fn misfit(pair: &Pair) -> f64 {
 /// By how much the information criterion has to prefer one model before the other is forgotten.
 const DECISIVE: f64 = 60.0;
 
-/// Chi-squared per degree of freedom up to which a circle is clean.
+/// Chi-squared per degree of freedom up to which a rim is clean.
 const CLEAN: f64 = 1.6;
 
 /// Uncertainty of the epipolar tangents, pixels, above which two arcs cannot be held against each other. Whole rims are at a hundredth, ones hidden by a third at a
@@ -196,9 +196,14 @@ impl Pair {
     }
 }
 
-/// Whether the edges lie on a circle as closely as their noise lets them.
+/// Whether the edges lie on the rim as closely as their noise lets them.
+fn is_clean(r: &Reconstruction) -> bool {
+    r.report.chi2 / r.report.dof.max(1) as f64 <= CLEAN
+}
+
+/// Whether they do, and the rim is a circle.
 fn is_clean_circle(r: &Reconstruction) -> bool {
-    r.model == RimModel::Circle && r.report.chi2 / r.report.dof.max(1) as f64 <= CLEAN
+    r.model == RimModel::Circle && is_clean(r)
 }
 
 /// Whether a plane rim's contours are the outer outlines of a bar as well: a torus and an ellipse are told apart by their other outline, or not at all. A circle
@@ -263,7 +268,7 @@ fn likeliest(
             None => (0..order.len().min(BAR_PAIRS)).collect(),
         };
         for (_, l, r) in likely.iter().filter_map(|k| order.get(*k)) {
-            let clean = best.as_ref().is_some_and(|(_, _, b)| is_clean_circle(&b.reconstruction));
+            let clean = best.as_ref().is_some_and(|(_, _, b)| is_clean(&b.reconstruction));
             let (found, support, excess) = bars(views, [&l.contour, &r.contour], p, options);
             // The best guess has to be the one that was followed and found wanting; that some other bar is not there says nothing.
             let decided = found.iter().any(|(e, b)| e.abs() > DECISIVE && b.support > 0.9 * support);
@@ -279,7 +284,7 @@ fn likeliest(
                 }
             }
             flat_beyond_doubt |= decided;
-            // A second outline that cannot be followed, and a first one that is no clean circle: nobody knows.
+            // A second outline that cannot be followed, and a first one that is no clean rim: nobody knows. Whether a clean one is a bar's, it tells itself.
             if best.is_some() && !decided && !clean && excess > search::SUPPORTED {
                 return ambiguous();
             }
