@@ -93,10 +93,9 @@ fn plane_ellipses_of_every_shape_are_found_and_right() {
         let ratio = [0.55, 0.7, 0.8, 0.9, 0.95, 1.0][k % 6];
         let middle = Vec3::new(0.23, 0.0, 1.4);
         let centre = middle + Vec3::new(r.uniform(-0.06, 0.06), r.uniform(-0.06, 0.06), r.uniform(-0.1, 0.1));
-        let toward = Vec3::new(0.0, 0.0, 0.0);
         let a = r.uniform(0.06, 0.09);
         let mut rim = rim_tilted(centre, r.uniform(0.1, 0.6), r.uniform(0.0, 6.3), a, a * ratio);
-        if (toward - centre).dot(&rim.normal) < 0.0 {
+        if centre.dot(&rim.normal) > 0.0 {
             rim.normal = -rim.normal;
             rim.axis_b = -rim.axis_b;
         }
