@@ -57,6 +57,10 @@ struct Guess {
     excess: f64,
 }
 
+/// Where a clean circle was clicked, only a guess this likely, in parts of the likeliest, is followed up besides it: a bright bar's shading may be the equal of
+/// its outline.
+const AS_LIKELY: f64 = 0.85;
+
 /// Looks for the bar whose outline was clicked. `plane` is what the contours are a picture of if they are a plane rim; with the bar's diameter known only that is tried.
 pub(in crate::offline) fn find(
     views: [&ViewEdges<'_>; 2],
@@ -64,11 +68,17 @@ pub(in crate::offline) fn find(
     plane: (Vector3<f64>, Vector3<f64>, f64),
     p: [&Projection; 2],
     options: &Options,
+    clean: bool,
 ) -> Search {
     let mut search = Search { found: Vec::new(), support: 0.0, excess: 0.0 };
     let Some(eyes) = camera_centre(p[0]).zip(camera_centre(p[1])) else { return search };
     let views = [View::new(views[0], clicked[0], p[0], eyes.0), View::new(views[1], clicked[1], p[1], eyes.1)];
-    for g in guesses(&views, clicked, plane, options) {
+    let guesses = guesses(&views, clicked, plane, options);
+    let likeliest = guesses.first().map_or(0.0, |g| g.likely);
+    for g in guesses {
+        if clean && g.likely < AS_LIKELY * likeliest {
+            break;
+        }
         search.support = search.support.max(g.worth);
         search.excess = search.excess.max(g.excess);
         let Some(bar) = settle(&views, g.torus, g.worth, options) else { continue };

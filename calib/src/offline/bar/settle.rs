@@ -25,6 +25,8 @@ const OUTWARD_STEPS: i32 = 8;
 const AS_GOOD: f64 = 0.7;
 /// What a limb's place is worth where its falling off is not seen undisturbed, pixels.
 const SPOILT_PX: f64 = 0.25;
+/// Noise about a bar (in the edges' own) of edges as they were detected, above which it is not worth another look: limbs beside paint reach seven.
+const HOPELESS: f64 = 8.0;
 /// Corners of a predicted outline.
 const CORNERS: usize = 720;
 
@@ -48,7 +50,7 @@ pub(in crate::offline::bar) fn settle(
         }
         torus = thicker;
     }
-    follow(views, torus, support, options, false).or_else(|| follow(views, torus, support, options, true))
+    follow(views, torus, support, options)
 }
 
 /// Fits the bar to the likeliest edges beside its outlines, again and again in narrowing windows.
@@ -119,45 +121,71 @@ fn outward(views: &[View<'_, '_>; 2], torus: &Torus) -> Option<Torus> {
     (moved.bar > torus.bar && moved.bar < 0.6 * moved.core).then_some(moved)
 }
 
+/// How the edges of a followed outline are brought to their place.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Sharp {
+    /// As they were detected.
+    No,
+    /// As a bar's limb; what is none is left out.
+    Limb,
+    /// As a bar's limb, and where something else beside it (paint, a spoke) disturbs its falling off, as an edge like others, known less well.
+    Spoilt,
+}
+
 /// Follows the four outlines of a bar, tells their edges from their neighbours, and fits the bar to them.
-///
-/// `spoilt` lets edges count whose falling off is disturbed by something else beside the limb (paint, a spoke): as edges like others, known less well.
-fn follow(views: &[View<'_, '_>; 2], start: Torus, support: f64, options: &Options, spoilt: bool) -> Option<BarFound> {
-    let bar = Options { rim: RimChoice::RoundBar, ..*options };
-    let mut torus = start;
-    let mut last = None;
-    for (tolerance, sharp) in [(1.5, false), (1.0, true)] {
-        let follow = |v: &View<'_, '_>| -> Option<[Contour; 2]> {
-            let [outer, inner] = v.outlines(&torus, CORNERS, STEP_PX);
-            let (noise, blur) = (v.edges.map.noise(), v.edges.blur());
-            let limb = Limb::new(blur, torus.bar / v.pixel_at(&torus.centre));
-            // Away from the bar is out of the outer outline, and into the inner one.
-            let finish = |r: &Refined, out: Pixel| match &limb {
+fn follow(views: &[View<'_, '_>; 2], start: Torus, support: f64, options: &Options) -> Option<BarFound> {
+    let (rough, torus) = followed(views, start, 1.5, Sharp::No, support, options)?;
+    if rough.reconstruction.report.noise > HOPELESS {
+        return None;
+    }
+    [Sharp::Limb, Sharp::Spoilt].into_iter().find_map(|sharp| {
+        let (bar, torus) = followed(views, torus, 1.0, sharp, support, options)?;
+        (bar.is_sound() && torus.bar > THINNEST * torus.core).then_some(bar)
+    })
+}
+
+/// The edges within a tolerance of a bar's outlines, and the bar fitted to them.
+fn followed(
+    views: &[View<'_, '_>; 2],
+    torus: Torus,
+    tolerance: f64,
+    sharp: Sharp,
+    support: f64,
+    options: &Options,
+) -> Option<(BarFound, Torus)> {
+    let outlines = |v: &View<'_, '_>| -> Option<[Contour; 2]> {
+        let [outer, inner] = v.outlines(&torus, CORNERS, STEP_PX);
+        let (noise, blur) = (v.edges.map.noise(), v.edges.blur());
+        let limb = Limb::new(blur, torus.bar / v.pixel_at(&torus.centre));
+        // Away from the bar is out of the outer outline, and into the inner one.
+        let finish = |r: &Refined, out: Pixel| {
+            let plain = || sharpen(v.edges.picture, r, noise, blur);
+            match &limb {
                 Some(l) => l.place(v.edges.picture, r, out, noise, blur).or_else(|| {
-                    let r = if spoilt { sharpen(v.edges.picture, r, noise, blur)? } else { return None };
+                    let r = if sharp == Sharp::Spoilt { plain()? } else { return None };
                     Some(Refined { sigma: r.sigma.hypot(SPOILT_PX), ..r })
                 }),
-                None => sharpen(v.edges.picture, r, noise, blur),
-            };
-            let inwards = |r: &Refined, out: Pixel| finish(r, -out);
-            let [away, into]: [&Finish<'_>; 2] = [&finish, &inwards];
-            Some([
-                v.edges.follow(&outer, tolerance, sharp.then_some(away))?,
-                v.edges.follow(&inner, tolerance, sharp.then_some(into))?,
-            ])
+                None => plain(),
+            }
         };
-        let [lo, li] = follow(&views[0])?;
-        let [ro, ri] = follow(&views[1])?;
-        let points = |o: &Contour, i: &Contour| {
-            let mut all = o.edge_points(Outline::Outer);
-            all.extend(i.edge_points(Outline::Inner));
-            all
-        };
-        let (l, r) = (points(&lo, &li), points(&ro, &ri));
-        let found = reconstruct(&l, views[0].p, &r, views[1].p, &bar).ok()?;
-        torus = Torus { centre: found.rim.centre, normal: found.rim.normal, core: found.rim.a, bar: found.bar_radius? };
-        let (outer, inner) = ([lo, ro], [li, ri]);
-        last = Some(BarFound { outer, inner, reconstruction: found, support });
-    }
-    last.filter(|b| b.is_sound() && torus.bar > THINNEST * torus.core)
+        let inwards = |r: &Refined, out: Pixel| finish(r, -out);
+        let [away, into]: [&Finish<'_>; 2] = [&finish, &inwards];
+        let wanted = sharp != Sharp::No;
+        Some([
+            v.edges.follow(&outer, tolerance, wanted.then_some(away))?,
+            v.edges.follow(&inner, tolerance, wanted.then_some(into))?,
+        ])
+    };
+    let [lo, li] = outlines(&views[0])?;
+    let [ro, ri] = outlines(&views[1])?;
+    let points = |o: &Contour, i: &Contour| {
+        let mut all = o.edge_points(Outline::Outer);
+        all.extend(i.edge_points(Outline::Inner));
+        all
+    };
+    let (l, r) = (points(&lo, &li), points(&ro, &ri));
+    let bar = Options { rim: RimChoice::RoundBar, ..*options };
+    let found = reconstruct(&l, views[0].p, &r, views[1].p, &bar).ok()?;
+    let torus = Torus { centre: found.rim.centre, normal: found.rim.normal, core: found.rim.a, bar: found.bar_radius? };
+    Some((BarFound { outer: [lo, ro], inner: [li, ri], reconstruction: found, support }, torus))
 }

@@ -139,13 +139,14 @@ fn bars(
     clicked: [&Contour; 2],
     p: [&Projection; 2],
     options: &Options,
+    clean: bool,
 ) -> (Vec<(f64, BarFound)>, f64, f64) {
     // An outline's ellipse misses its tangents by less than a lenient gate, and its plane rim is a start for the bar.
     let plane = Options { rim: RimChoice::Edge, calibration_px: options.calibration_px.max(2.0), ..*options };
     let points = [0, 1].map(|k| clicked[k].edge_points(Outline::Outer));
     let Ok(r) = reconstruct(&points[0], p[0], &points[1], p[1], &plane) else { return (Vec::new(), 0.0, 0.0) };
     let start = (r.rim.centre, r.rim.normal, (r.rim.a * r.rim.b).sqrt());
-    let found = search::find(views, clicked, start, p, options);
+    let found = search::find(views, clicked, start, p, options, clean);
     let mut out: Vec<(f64, BarFound)> = found.found.into_iter().map(|b| (b.evidence(p, options), b)).collect();
     // Of two bars the one whose outlines are the more complete and keep to it the closer: their evidences are about different edges.
     out.sort_by(|a, b| a.1.doubt().total_cmp(&b.1.doubt()));
@@ -269,7 +270,8 @@ fn likeliest(
         };
         for (_, l, r) in likely.iter().filter_map(|k| order.get(*k)) {
             let clean = best.as_ref().is_some_and(|(_, _, b)| is_clean(&b.reconstruction));
-            let (found, support, excess) = bars(views, [&l.contour, &r.contour], p, options);
+            let round = best.as_ref().is_some_and(|(_, _, b)| is_clean_circle(&b.reconstruction));
+            let (found, support, excess) = bars(views, [&l.contour, &r.contour], p, options, round);
             // The best guess has to be the one that was followed and found wanting; that some other bar is not there says nothing.
             let decided = found.iter().any(|(e, b)| e.abs() > DECISIVE && b.support > 0.9 * support);
             if let Some((evidence, bar)) = found.into_iter().next() {
@@ -315,7 +317,7 @@ fn round_bar(
     for (tried, (_, l, r)) in order.iter().take(BAR_PAIRS).enumerate() {
         let clicked = [&l.contour, &r.contour];
         let whole = |b: &BarFound| b.outer.iter().chain(&b.inner).map(|c| c.coverage).sum::<f64>();
-        let found = bars(views, clicked, p, options).0.into_iter().map(|b| b.1);
+        let found = bars(views, clicked, p, options, false).0.into_iter().map(|b| b.1);
         if let Some(best) = found.max_by(|a, b| whole(a).total_cmp(&whole(b))) {
             return Ok(Pair { tried, ..best.into() });
         }
