@@ -1,7 +1,7 @@
 //! From a guess to a bar: its outlines are followed and the bar is fitted to them until it stands still.
 
 use crate::offline::bar::found::BarFound;
-use crate::offline::bar::limb::Limb;
+use crate::offline::bar::limb::{Limb, THINNEST_PX};
 use crate::offline::bar::outlines::{View, support};
 use crate::offline::bar::torus::{Free, Ray, Torus, fit, rays};
 use crate::offline::conic::robust::median;
@@ -138,8 +138,11 @@ fn follow(views: &[View<'_, '_>; 2], start: Torus, support: f64, options: &Optio
     if rough.reconstruction.report.noise > HOPELESS {
         return None;
     }
-    [Sharp::Limb, Sharp::Spoilt].into_iter().find_map(|sharp| {
-        let (bar, torus) = followed(views, torus, 1.0, sharp, support, options)?;
+    // A bar that is too thin for a limb has edges like others, and nothing to spoil.
+    let thin = views.iter().all(|v| torus.bar < THINNEST_PX * v.pixel_at(&torus.centre));
+    let ways: &[Sharp] = if thin { &[Sharp::Limb] } else { &[Sharp::Limb, Sharp::Spoilt] };
+    ways.iter().find_map(|sharp| {
+        let (bar, torus) = followed(views, torus, 1.0, *sharp, support, options)?;
         (bar.is_sound() && torus.bar > THINNEST * torus.core).then_some(bar)
     })
 }
