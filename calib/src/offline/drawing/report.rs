@@ -2,6 +2,8 @@
 
 use crate::offline::contour::Contour;
 use crate::offline::plan::Plan;
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use nalgebra::{Matrix2, Matrix3};
 use std::f64::consts::TAU;
 use std::fmt::Write;
@@ -162,7 +164,7 @@ pub(in crate::offline) fn head(
         let _ = write!(h, "<div class=note>{}</div>", escape(w));
     }
     if let Some((png, alt)) = picture {
-        let _ = write!(h, "<p><img alt=\"{alt}\" src=\"data:image/png;base64,{}\">", base64(png));
+        let _ = write!(h, "<p><img alt=\"{alt}\" src=\"data:image/png;base64,{}\">", STANDARD.encode(png));
     }
     h
 }
@@ -238,41 +240,56 @@ fn ellipse_path(m: &Matrix2<f64>, scale: f64, cx: f64, cy: f64) -> String {
     s + "Z"
 }
 
+/// A square cross of grid lines about the middle of a plot, opened as SVG: the text so far, pixels a unit, and the middle.
+pub(in crate::offline) struct Cross {
+    pub(in crate::offline) svg: String,
+    pub(in crate::offline) scale: f64,
+    pub(in crate::offline) middle: [f64; 2],
+}
+
+impl Cross {
+    /// Width of the plot, pixels.
+    pub(in crate::offline) const WIDTH: f64 = 560.0;
+    const HEIGHT: f64 = 300.0;
+
+    /// `label` is read out, `largest` is what has to fit, `digits` are those of the ticks.
+    pub(in crate::offline) fn new(label: &str, largest: f64, digits: usize) -> Self {
+        let (w, h) = (Self::WIDTH, Self::HEIGHT);
+        let scale = 0.5 * (h - 40.0) / largest;
+        let (cx, cy) = (0.5 * w, 0.5 * h + 6.0);
+        let mut s =
+            format!("<svg viewBox=\"0 0 {w} {h}\" role=img aria-label=\"{label}\" font-size=12 fill=currentColor>");
+        let step = tick(2.0 * largest);
+        let n = (largest / step).floor() as i32;
+        for k in -n..=n {
+            let d = f64::from(k) * step * scale;
+            let opacity = if k == 0 { ".6" } else { ".15" };
+            let _ = write!(
+                s,
+                "<path d=\"M{:.1} 20V{:.1}M40 {:.1}H{:.1}\" stroke=currentColor opacity={opacity} />",
+                cx + d,
+                h - 16.0,
+                cy + d,
+                w - 20.0
+            );
+            if k != 0 {
+                let value = f64::from(k) * step;
+                let _ = write!(s, "<text x={:.1} y={:.1} text-anchor=middle>{value:.digits$}</text>", cx + d, h - 3.0);
+            }
+        }
+        Self { svg: s, scale, middle: [cx, cy] }
+    }
+}
+
 pub(in crate::offline) fn cross_plot(
     title: &str,
     unit: &str,
     axes: [&str; 2],
     shapes: &[(Matrix2<f64>, &str, &str)],
 ) -> String {
-    let (w, h) = (560.0, 300.0);
     let largest =
         shapes.iter().map(|(m, _, _)| m[(0, 0)].max(m[(1, 1)]).max(0.0).sqrt()).fold(1e-12, f64::max) * 2.45 * 1.15;
-    let scale = 0.5 * (h - 40.0) / largest;
-    let (cx, cy) = (0.5 * w, 0.5 * h + 6.0);
-    let mut s = format!("<svg viewBox=\"0 0 {w} {h}\" role=img aria-label=\"{title}\" font-size=12 fill=currentColor>");
-    let step = tick(2.0 * largest);
-    let n = (largest / step).floor() as i32;
-    for k in -n..=n {
-        let d = f64::from(k) * step * scale;
-        let opacity = if k == 0 { ".6" } else { ".15" };
-        let _ = write!(
-            s,
-            "<path d=\"M{:.1} 20V{:.1}M40 {:.1}H{:.1}\" stroke=currentColor opacity={opacity} />",
-            cx + d,
-            h - 16.0,
-            cy - d,
-            w - 20.0
-        );
-        if k != 0 {
-            let _ = write!(
-                s,
-                "<text x={:.1} y={:.1} text-anchor=middle>{:.3}</text>",
-                cx + d,
-                h - 3.0,
-                f64::from(k) * step
-            );
-        }
-    }
+    let Cross { svg: mut s, scale, middle: [cx, cy] } = Cross::new(title, largest, 3);
     for (i, (m, colour, name)) in shapes.iter().enumerate() {
         let _ = write!(
             s,
@@ -284,7 +301,7 @@ pub(in crate::offline) fn cross_plot(
     let _ = write!(
         s,
         "<text x=44 y=16 font-weight=600>{title}, {unit}</text><text x={} y=16 text-anchor=end>{} right, {} up</text></svg>",
-        w - 20.0,
+        Cross::WIDTH - 20.0,
         axes[0],
         axes[1]
     );
@@ -307,33 +324,9 @@ pub(in crate::offline) fn normal_plot(covariance: &Matrix2<f64>) -> String {
     cross_plot("normal", "degrees", ["e1", "e2"], &[(covariance * k * k, "#bc4c00", "tilt about the plane's axes")])
 }
 
-fn base64(data: &[u8]) -> String {
-    const LETTERS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let mut out = String::with_capacity(data.len() * 4 / 3 + 4);
-    for chunk in data.chunks(3) {
-        let b = |k: usize| u32::from(chunk.get(k).copied().unwrap_or(0));
-        let n = b(0) << 16 | b(1) << 8 | b(2);
-        for k in 0..4 {
-            if k <= chunk.len() {
-                out.push(LETTERS.get((n >> (18 - 6 * k) & 63) as usize).map_or('=', |c| char::from(*c)));
-            } else {
-                out.push('=');
-            }
-        }
-    }
-    out
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn base64_known_answers() {
-        for (a, b) in [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foobar", "Zm9vYmFy")] {
-            assert_eq!(base64(a.as_bytes()), b);
-        }
-    }
 
     #[test]
     fn ticks_are_few_and_round() {

@@ -4,7 +4,7 @@ use super::filter::Judged;
 use super::plan::{MeshPlan, Placed, Survey};
 use super::pose::{Picked, residuals};
 use crate::files::RigFile;
-use crate::offline::drawing::report::{centre_plot, escape, head, normal_plot, row, tick};
+use crate::offline::drawing::report::{Cross, centre_plot, escape, head, normal_plot, row};
 use graspd_rt::geom::{Pixel, Vec3};
 use nalgebra::{Matrix2, Matrix3};
 use std::fmt::Write;
@@ -153,32 +153,9 @@ fn picks(h: &mut String, placed: &Placed, rig: &RigFile) {
 
 /// Differences in pixels as numbered dots round a cross; down is down as in the picture.
 fn scatter(name: &str, points: &[(usize, Pixel)], rms: f64) -> String {
-    let (w, h) = (560.0, 300.0);
     let largest = points.iter().map(|(_, p)| p.x.abs().max(p.y.abs())).fold(1.2 * rms, f64::max).max(0.02) * 1.15;
-    let scale = 0.5 * (h - 40.0) / largest;
-    let (cx, cy) = (0.5 * w, 0.5 * h + 6.0);
-    let mut s = format!(
-        "<svg viewBox=\"0 0 {w} {h}\" role=img aria-label=\"residuals of the picks, {name}\" font-size=12 fill=currentColor>"
-    );
-    let step = tick(2.0 * largest);
-    let n = (largest / step).floor() as i32;
-    for k in -n..=n {
-        let d = f64::from(k) * step * scale;
-        let opacity = if k == 0 { ".6" } else { ".15" };
-        let _ = write!(
-            s,
-            "<path d=\"M{:.1} 20V{:.1}M40 {:.1}H{:.1}\" stroke=currentColor opacity={opacity} />",
-            cx + d,
-            h - 16.0,
-            cy + d,
-            w - 20.0
-        );
-        if k != 0 {
-            let value = f64::from(k) * step;
-            let _ = write!(s, "<text x={:.1} y={:.1} text-anchor=middle>{value:.2}</text>", cx + d, h - 3.0);
-            let _ = write!(s, "<text x=36 y={:.1} text-anchor=end>{value:.2}</text>", cy + d + 4.0);
-        }
-    }
+    let Cross { svg: mut s, scale, middle: [cx, cy] } =
+        Cross::new(&format!("residuals of the picks, {name}"), largest, 2);
     let _ = write!(s, "<circle cx={cx} cy={cy} r={:.1} fill=none stroke=#2da44e stroke-width=1.5 />", rms * scale);
     for (k, p) in points {
         let (x, y) = (cx + p.x * scale, cy + p.y * scale);
