@@ -89,7 +89,12 @@ fn a_python_driver_feeds_the_daemon() {
         std::thread::sleep(Duration::from_millis(100));
         last = world.state();
     }
-    let (_, said) = world.verb(&["status"]);
+    // The state may come with the very first pictures; that they go on coming takes a few more.
+    let (_, mut said) = world.verb(&["status"]);
+    while said["frames"].as_u64().unwrap_or(0) <= 5 && Instant::now() < until {
+        std::thread::sleep(Duration::from_millis(100));
+        said = world.verb(&["status"]).1;
+    }
     if last.0 == "tracking" {
         world.insist(&["setpoint", &world.path("plan.toml")]);
         world.insist(&["arm"]);
