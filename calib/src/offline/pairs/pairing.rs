@@ -262,7 +262,6 @@ fn likeliest(
         }
     }
     let best = accepted.into_iter().min_by(|a, b| a.0.total_cmp(&b.0));
-    let mut flat_beyond_doubt = false;
     if options.rim == RimChoice::Auto {
         let likely: Vec<usize> = match &best {
             Some((_, tried, _)) => vec![*tried],
@@ -285,7 +284,6 @@ fn likeliest(
                     }
                 }
             }
-            flat_beyond_doubt |= decided;
             // A second outline that cannot be followed, and a first one that is no clean rim: nobody knows. Whether a clean one is a bar's, it tells itself.
             if best.is_some() && !decided && !clean && excess > search::SUPPORTED {
                 return ambiguous();
@@ -293,7 +291,7 @@ fn likeliest(
         }
     }
     if let Some((_, _, best)) = best {
-        if options.rim == RimChoice::Auto && !flat_beyond_doubt && may_be_a_bar(&best, p, options) {
+        if options.rim == RimChoice::Auto && may_be_a_bar(&best, p, options) {
             return ambiguous();
         }
         return Ok(best);
