@@ -59,7 +59,18 @@ pub struct ViewEdges<'a> {
     /// Edges brought to their place, by index: contours that compete share most of theirs.
     refined: RefCell<HashMap<u32, Option<Refined>>>,
     /// Contours with what became of them when their edges were told apart: each is paired with several of the other view.
-    sharp: RefCell<Vec<(Contour, Contour)>>,
+    sharp: RefCell<Vec<(Contour, Sharpened)>>,
+}
+
+/// What became of a contour when its edges were told apart from their neighbours.
+#[derive(Clone, Debug)]
+enum Sharpened {
+    /// They could be.
+    Apart(Contour),
+    /// Too few of them could be.
+    TooFew,
+    /// They scatter by more than they say: root mean square, pixels.
+    Scattered(f64),
 }
 
 /// An edge point of a contour.
@@ -240,8 +251,8 @@ impl<'a> ViewEdges<'a> {
         *self.blur.get_or_init(|| lens_blur(self.picture, &self.map))
     }
 
-    /// The same contour with every edge told apart from its neighbours (see [`crate::offline::edges::sharpen`]); the contour itself where too few can be.
-    pub(in crate::offline) fn sharpened(&self, c: &Contour) -> Contour {
+    /// What becomes of a contour when every edge is told apart from its neighbours (see [`crate::offline::edges::sharpen`]).
+    fn sharpened(&self, c: &Contour) -> Sharpened {
         if let Some((_, known)) = self.sharp.borrow().iter().find(|(from, _)| from == c) {
             return known.clone();
         }
@@ -254,7 +265,7 @@ impl<'a> ViewEdges<'a> {
         sharp
     }
 
-    fn sharpen(&self, c: &Contour) -> Contour {
+    fn sharpen(&self, c: &Contour) -> Sharpened {
         let blur = self.blur();
         let w = Walk::new(&c.ellipse);
         let sign = if c.bright_inside { -1.0 } else { 1.0 };
@@ -277,22 +288,42 @@ impl<'a> ViewEdges<'a> {
             }
         }
         if points.len() * 2 < c.points.len() {
-            return c.clone();
+            return Sharpened::TooFew;
         }
         let bins = ((w.perimeter() / INDEPENDENT_PX) as usize).clamp(12, 4000);
         let Some(sharp) = points_on_one_ellipse(points, c.ellipse, c.bright_inside, bins, rejected) else {
-            return c.clone();
+            return Sharpened::TooFew;
         };
         // Where edges are no blurred steps (a real lens, texture beside the rim, a picture that was sharpened or compressed) taking them apart scatters them, by
         // more than it says. What it moves them by is then doubt, and no correction.
         let says = median(sharp.points.iter().map(|p| p.edge.sigma).collect());
         if sharp.rms_px > SCATTERED_BY * c.rms_px && sharp.rms_px > BEYOND * says {
-            let mut plain = c.clone();
-            plain.points.iter_mut().for_each(|p| p.edge.sigma = p.edge.sigma.hypot(sharp.rms_px));
-            return plain;
+            return Sharpened::Scattered(sharp.rms_px);
         }
-        sharp
+        Sharpened::Apart(sharp)
     }
+}
+
+/// Two views' pictures of one contour with every edge told apart from its neighbours, where that can be done.
+///
+/// What scatters the edges of one view would do so in the other, only less visibly, and what neighbours move edges by is much the same in both: it leaves the depth
+/// alone as long as both views keep it. So both are told apart, or neither.
+pub(in crate::offline) fn told_apart(views: [&ViewEdges<'_>; 2], clicked: [&Contour; 2]) -> [Contour; 2] {
+    let sharp = [views[0].sharpened(clicked[0]), views[1].sharpened(clicked[1])];
+    let scatter = sharp.iter().filter_map(|s| match s {
+        Sharpened::Scattered(rms_px) => Some(*rms_px),
+        _ => None,
+    });
+    if let Some(rms_px) = scatter.reduce(f64::max) {
+        return clicked.map(|c| {
+            let mut plain = c.clone();
+            plain.points.iter_mut().for_each(|p| p.edge.sigma = p.edge.sigma.hypot(rms_px));
+            plain
+        });
+    }
+    let [left, right] = sharp;
+    let one = |s: Sharpened, c: &Contour| if let Sharpened::Apart(sharp) = s { sharp } else { c.clone() };
+    [one(left, clicked[0]), one(right, clicked[1])]
 }
 
 /// Fits the ellipse to refined points, drops those that do not lie on it, and puts the rest in order.

@@ -8,7 +8,7 @@
 use crate::offline::bar::found::BarFound;
 use crate::offline::bar::search;
 use crate::offline::contour::select::Candidate;
-use crate::offline::contour::{Contour, ViewEdges};
+use crate::offline::contour::{Contour, ViewEdges, told_apart};
 use crate::offline::rim::model::{Options, Outline, Projection, Reconstruction, RimChoice, RimModel};
 use crate::offline::rim::reconstruct::{bar_alone, cut_off, reconstruct, tolerable};
 use crate::offline::rim::refusal::Refusal;
@@ -59,7 +59,7 @@ fn sharpened(
     p: [&Projection; 2],
     options: &Options,
 ) -> Result<Pair, Refusal> {
-    let contours = [views[0].sharpened(clicked[0]), views[1].sharpened(clicked[1])];
+    let contours = told_apart(views, clicked);
     let all = [0, 1].map(|k| contours[k].edge_points(Outline::Outer));
     let run = |o: &Options| reconstruct(&all[0], p[0], &all[1], p[1], o);
     let mut reconstruction = run(options)?;
@@ -319,7 +319,7 @@ fn round_bar(
         if let Some(best) = found.max_by(|a, b| whole(a).total_cmp(&whole(b))) {
             return Ok(Pair { tried, ..best.into() });
         }
-        let contours = [views[0].sharpened(clicked[0]), views[1].sharpened(clicked[1])];
+        let contours = told_apart(views, clicked);
         let points = [0, 1].map(|k| contours[k].edge_points(Outline::Outer));
         match reconstruct(&points[0], p[0], &points[1], p[1], options) {
             // A bar without thickness is one outline taken for two.
