@@ -2,21 +2,23 @@
 //! contour, and no number of points averages that out.
 //!
 //! A covariance from the residuals alone is too small by that, several times over on clean pictures. So smooth waves round each contour are let through the
-//! linearised fit, each by itself, and what they do to centre, normal and axes is added to the covariance. How large the waves are is read
-//! from the residuals: the fit takes up the waves of two and less periods, and leaves those of three to six for all to see.
+//! linearised fit, each by itself, and what they do to centre, normal and axes is added to the covariance. How large the waves are is read from the residuals:
+//! the fit takes up most of the slow waves, but not what differs between the views or is no circle's picture, and leaves the quick ones for all to see.
 
 use crate::offline::bar::torus::{Torus, rays};
 use crate::offline::conic::sampson::distance;
 use crate::offline::rim::circle::frame_of;
 use crate::offline::rim::ml::image_conic;
 use crate::offline::rim::model::{EdgePoint, Projection, Reconstruction, Rim, RimModel};
-use nalgebra::{DMatrix, DVector, Matrix2, Vector3};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Matrix2, SymmetricEigen, Vector3};
 
 /// Waves that are let through the fit, by their number of periods, and how large they are to each other: slow ones move whole outlines and are the
 /// rule, quick ones come from shading here and there.
 const WAVES: [f64; 5] = [1.0, 1.0, 0.6, 0.4, 0.3];
-/// Waves whose size is read from the residuals.
-const VISIBLE: std::ops::RangeInclusive<usize> = 3..=6;
+/// Quickest waves whose size is read from the residuals, in periods.
+const QUICKEST: usize = 6;
+/// Part of the best seen direction's information below which the fit has taken a wave up.
+const LEAST_SEEN: f64 = 0.02;
 /// Parameters at most: centre, normal, two axes and their direction.
 const MOST: usize = 8;
 
@@ -69,35 +71,16 @@ pub(in crate::offline) fn widen(
     }
     let normal = j.transpose() * &weighted;
     let solve = normal.cholesky()?;
-    let size = wave_size(&here, &used, &sigma, stretches).hypot(floor_px);
-    let all = WAVES.iter().map(|w| w * w).sum::<f64>().sqrt();
+    let waves = Waves::new(stretches);
+    let size = waves
+        .size(&here, &weighted, &used, &sigma, &solve)
+        .hypot(floor_px / WAVES.iter().map(|w| w * w).sum::<f64>().sqrt());
     let mut cov = DMatrix::<f64>::zeros(k, k);
-    let mut first = 0;
-    for s in stretches {
-        for (wave, weight) in WAVES.iter().enumerate() {
-            let share = size * weight / all;
-            for part in 0..2 {
-                if wave == 0 && part == 1 {
-                    continue;
-                }
-                let shape = |t: f64| match (wave, part) {
-                    (0, _) => share,
-                    (w, 0) => share * (w as f64 * t).cos(),
-                    (w, _) => share * (w as f64 * t).sin(),
-                };
-                let mut push = DVector::<f64>::zeros(k);
-                for (n, t) in s.place.iter().enumerate() {
-                    let row = weighted.row(first + n);
-                    let b = shape(*t);
-                    for i in 0..k {
-                        push[i] += row[i] * b;
-                    }
-                }
-                let moved = solve.solve(&push);
-                cov += &moved * moved.transpose();
-            }
+    for (column, wave) in waves.columns.column_iter().zip(&waves.wave) {
+        if *wave < WAVES.len() {
+            let moved = solve.solve(&(weighted.transpose() * column)) * size;
+            cov += &moved * moved.transpose();
         }
-        first += s.points.len();
     }
     for a in 0..k {
         for b in 0..k {
@@ -156,51 +139,86 @@ fn residuals(r: &Reconstruction, d: &[f64; MOST], stretches: &[Stretch<'_>], p: 
     out.iter().all(|v| v.is_finite()).then_some(out)
 }
 
-/// Root mean square over all contours of the waves that the fit cannot take up, beyond what independent noise makes of them, scaled to all waves.
-fn wave_size(residual: &[f64], used: &[bool], sigma: &[f64], stretches: &[Stretch<'_>]) -> f64 {
-    let (mut excess, mut waves) = (0.0, 0usize);
-    let mut first = 0;
-    for s in stretches {
-        let pick: Vec<(f64, f64, f64)> = s
-            .place
-            .iter()
-            .enumerate()
-            .filter(|(n, _)| used.get(first + n).copied().unwrap_or(false))
-            .map(|(n, t)| {
-                (
-                    *t,
-                    residual.get(first + n).copied().unwrap_or(0.0),
-                    sigma.get(first + n).copied().unwrap_or(1.0).powi(-2),
-                )
-            })
-            .collect();
-        first += s.points.len();
-        if pick.len() < 30 {
-            continue;
-        }
-        let total: f64 = pick.iter().map(|q| q.2).sum();
-        for wave in VISIBLE {
-            let w = wave as f64;
-            for part in 0..2 {
-                let shape = |t: f64| if part == 0 { (w * t).cos() } else { (w * t).sin() };
-                let (mut xy, mut xx, mut noise) = (0.0, 0.0, 0.0);
-                for (t, d, weight) in &pick {
-                    let x = shape(*t);
-                    xy += weight * x * d;
-                    xx += weight * x * x;
-                    noise += weight * weight * x * x * d * d;
+/// The waves of all contours, a column each, the slow ones larger.
+struct Waves {
+    columns: DMatrix<f64>,
+    /// Number of periods of each column.
+    wave: Vec<usize>,
+}
+
+impl Waves {
+    fn new(stretches: &[Stretch<'_>]) -> Self {
+        let count: usize = stretches.iter().map(|s| s.place.len()).sum();
+        let kinds: Vec<(usize, usize)> =
+            (0..=QUICKEST).flat_map(|w| (0..if w == 0 { 1 } else { 2 }).map(move |part| (w, part))).collect();
+        let mut columns = DMatrix::<f64>::zeros(count, kinds.len() * stretches.len());
+        let mut wave = Vec::new();
+        let mut first = 0;
+        for s in stretches {
+            for (w, part) in &kinds {
+                let share = WAVES.get(*w).or(WAVES.last()).copied().unwrap_or(0.0);
+                for (n, t) in s.place.iter().enumerate() {
+                    let (sin, cos) = (*w as f64 * t).sin_cos();
+                    columns[(first + n, wave.len())] = share * if *part == 0 { cos } else { sin };
                 }
-                if xx > 0.1 * total {
-                    // Half the squared amplitude is the wave's mean square.
-                    excess += 0.5 * ((xy / xx).powi(2) - noise / (xx * xx));
-                    waves += 1;
-                }
+                wave.push(*w);
             }
+            first += s.place.len();
         }
+        Self { columns, wave }
     }
-    if waves == 0 {
-        return 0.0;
+
+    /// Size of the waves in the residuals, pixels, beyond what independent noise makes of them; read where the fit cannot take them up.
+    ///
+    /// With the fit's projection H and weights W, residuals are (I - H)(B a + e): q = B' W r has the variance s^2 G^2 + k G along each eigenvector of
+    /// G = B' W (I - H) B, where k is the scale of the independent noise.
+    fn size(
+        &self,
+        residual: &[f64],
+        weighted: &DMatrix<f64>,
+        used: &[bool],
+        sigma: &[f64],
+        solve: &Cholesky<f64, Dyn>,
+    ) -> f64 {
+        let weight = |n: usize| {
+            if used.get(n).copied().unwrap_or(false) { sigma.get(n).map_or(0.0, |s| s.powi(-2)) } else { 0.0 }
+        };
+        let mut heavy = self.columns.clone();
+        for n in 0..heavy.nrows() {
+            heavy.row_mut(n).scale_mut(weight(n));
+        }
+        let taken = weighted.transpose() * &self.columns;
+        let g = self.columns.transpose() * &heavy - taken.transpose() * solve.solve(&taken);
+        let r = DVector::from_column_slice(residual);
+        let q = heavy.transpose() * &r;
+        let eigen = SymmetricEigen::new(g);
+        let along = eigen.eigenvectors.transpose() * q;
+        let largest = eigen.eigenvalues.max();
+        let seen: Vec<(f64, f64)> = eigen
+            .eigenvalues
+            .iter()
+            .zip(along.iter())
+            .map(|(l, z)| (*l, *z))
+            .filter(|(l, _)| *l > LEAST_SEEN * largest)
+            .collect();
+        let mut chi2: f64 = residual.iter().enumerate().map(|(n, d)| weight(n) * d * d).sum();
+        chi2 -= seen.iter().map(|(l, z)| z * z / l).sum::<f64>();
+        let free = used.iter().filter(|u| **u).count() as f64 - weighted.ncols() as f64 - seen.len() as f64;
+        if free < 20.0 {
+            return 0.0;
+        }
+        let noise = (chi2 / free).max(0.0);
+        let mut s2 = 0.0;
+        // The weights of the directions depend on the size; a few rounds settle both.
+        for _ in 0..10 {
+            let (mut sum, mut total) = (0.0, 0.0);
+            for (l, z) in &seen {
+                let w = (s2 + noise / l).powi(-2);
+                sum += w * (z * z - noise * l) / (l * l);
+                total += w;
+            }
+            s2 = (sum / total).max(0.0);
+        }
+        if s2.is_finite() { s2.sqrt() } else { 0.0 }
     }
-    // Each period count has two waves, and the contour has all of them.
-    (excess.max(0.0) / waves as f64 * 2.0 * WAVES.len() as f64).sqrt()
 }
