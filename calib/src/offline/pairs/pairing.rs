@@ -9,6 +9,7 @@ use crate::offline::bar::found::BarFound;
 use crate::offline::bar::search;
 use crate::offline::contour::select::Candidate;
 use crate::offline::contour::{Contour, ViewEdges, told_apart};
+use crate::offline::rim::average::{average, share_of_ellipse};
 use crate::offline::rim::model::{Options, Outline, Projection, Reconstruction, RimChoice, RimModel};
 use crate::offline::rim::reconstruct::{bar_alone, cut_off, reconstruct, tolerable};
 use crate::offline::rim::refusal::Refusal;
@@ -167,8 +168,7 @@ pub fn pair(
     options: &Options,
 ) -> Result<Pair, Unpaired> {
     // What the task tolerates must not choose the contours: a wrong pair may well be the more certain one.
-    let whatever = Options { max_sigma_centre: Some(f64::INFINITY), max_sigma_normal: f64::INFINITY, ..*options };
-    let mut found = likeliest(views, candidates, p, &whatever)?;
+    let mut found = likeliest(views, candidates, p, &options.tolerating_anything())?;
     found.doubt(p, options).map_err(|refusal| Unpaired { refusal, swapped_fits: false })?;
     Ok(found)
 }
@@ -190,8 +190,20 @@ impl Pair {
             })
             .collect();
         let r = &mut self.reconstruction;
-        if options.edge_bias_px > 0.0 {
-            widen(r, &stretches, p, SHARE_OF_BIAS * options.edge_bias_px);
+        let floor = (options.edge_bias_px > 0.0).then_some(SHARE_OF_BIAS * options.edge_bias_px);
+        if let Some(floor) = floor {
+            widen(r, &stretches, p, floor);
+        }
+        let chosen = matches!(options.rim, RimChoice::Auto | RimChoice::Edge) && r.model == RimModel::Circle;
+        if let Some(share) = share_of_ellipse(&r.report.scores).filter(|_| chosen) {
+            let whatever = Options { rim: RimChoice::Ellipse, ..*options }.tolerating_anything();
+            let outer = [0, 1].map(|k| self.contours[k].edge_points(Outline::Outer));
+            if let Ok(mut ellipse) = reconstruct(&outer[0], p[0], &outer[1], p[1], &whatever) {
+                if let Some(floor) = floor {
+                    widen(&mut ellipse, &stretches, p, floor);
+                }
+                average(r, &ellipse, share);
+            }
         }
         tolerable(r.report.sigma_centre, r.report.sigma_normal, r.rim.a, r.report.vergence, r.model, options)
     }

@@ -143,6 +143,13 @@ impl Default for Options {
     }
 }
 
+impl Options {
+    /// The same, but whatever comes out is certain enough.
+    pub(in crate::offline) fn tolerating_anything(self) -> Self {
+        Self { max_sigma_centre: Some(f64::INFINITY), max_sigma_normal: f64::INFINITY, ..self }
+    }
+}
+
 /// An ellipse in a picture or in a plane: centre, semi-axes `a >= b > 0`, direction of `a` in `[0, pi)` from x towards y.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ellipse2 {
