@@ -1,10 +1,11 @@
-//! One click a view on the front rim of the real motorcycle pair, against the ground truth and the reference's own figures.
+//! One click a view on the rims of the real motorcycle pair, against the ground truth and the reference's own figures.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::{GripperFile, RigFile};
 use graspd_calib::offline::contour::select::Selection;
 use graspd_calib::offline::edges::picture::Picture;
-use graspd_calib::offline::plan::{PlanOptions, plan};
+use graspd_calib::offline::plan::{Plan, PlanOptions, plan};
+use graspd_calib::offline::rim::model::RimChoice;
 use graspd_rt::geom::{Pixel, Vec3};
 use std::path::PathBuf;
 
@@ -16,7 +17,12 @@ struct Example {
     pictures: [Picture; 2],
     rig: RigFile,
     gripper: GripperFile,
-    traced: serde_json::Value,
+    front: serde_json::Value,
+    rear: serde_json::Value,
+}
+
+fn traced(name: &str) -> serde_json::Value {
+    serde_json::from_str(&std::fs::read_to_string(example(name)).unwrap()).unwrap()
 }
 
 fn load() -> Example {
@@ -24,7 +30,8 @@ fn load() -> Example {
         pictures: ["left.png", "right.png"].map(|f| Picture::load(&example(f)).unwrap()),
         rig: RigFile::load(&example("rig.toml")).unwrap(),
         gripper: GripperFile::load(&example("gripper.toml")).unwrap(),
-        traced: serde_json::from_str(&std::fs::read_to_string(example("front_rim.json")).unwrap()).unwrap(),
+        front: traced("front_rim.json"),
+        rear: traced("rear_rim.json"),
     }
 }
 
@@ -37,43 +44,100 @@ fn click(v: &serde_json::Value) -> Selection {
     Selection::Click(Pixel::new(p[0], p[1]))
 }
 
+fn centre(v: &serde_json::Value) -> Vec3 {
+    Vec3::from_vec(numbers(&v["centre"])) * 1e-3
+}
+
+fn normal(v: &serde_json::Value) -> Vec3 {
+    Vec3::from_vec(numbers(&v["normal"])).normalize()
+}
+
+fn ratio(v: &serde_json::Value) -> f64 {
+    v["b"].as_f64().unwrap() / v["a"].as_f64().unwrap()
+}
+
+/// Distance from the ground truth, millimetres and degrees.
+fn far(c: &Vec3, n: &Vec3, truth: &serde_json::Value) -> (f64, f64) {
+    ((c - centre(truth)).norm() * 1e3, n.angle(&normal(truth)).to_degrees())
+}
+
+impl Example {
+    /// What clicks at these places lead to.
+    fn clicked(&self, rim: &serde_json::Value, choice: RimChoice, step: usize) -> Vec<Plan> {
+        let (l, r) = (rim["clicks_left"].as_array().unwrap(), rim["clicks_right"].as_array().unwrap());
+        let mut options = PlanOptions::default();
+        options.rim.rim = choice;
+        options.rim.max_sigma_centre = Some(0.01);
+        options.rim.max_sigma_normal = 3f64.to_radians();
+        let one = |(a, b)| {
+            let selections = [click(a), click(b)];
+            plan(
+                [&self.pictures[0], &self.pictures[1]],
+                [&selections[0], &selections[1]],
+                &self.rig,
+                &self.gripper,
+                &options,
+            )
+            .unwrap()
+        };
+        l.iter().zip(r).step_by(step).map(one).collect()
+    }
+}
+
+/// Whatever place of the rim was clicked, it is the same rim.
+fn assert_same(plans: &[Plan], within: f64) {
+    let first = plans[0].reconstruction.rim.centre;
+    assert!(plans.iter().all(|p| (p.reconstruction.rim.centre - first).norm() < within));
+}
+
 #[test]
-fn one_click_a_view_finds_the_rim_as_well_as_the_reference_does() {
+fn one_click_a_view_finds_the_front_rim_as_well_as_the_reference_does() {
     let e = load();
-    let truth = &e.traced["reference"]["ground_truth"];
-    let centre = |v: &serde_json::Value| Vec3::from_vec(numbers(&v["centre"])) * 1e-3;
-    let normal = |v: &serde_json::Value| Vec3::from_vec(numbers(&v["normal"]));
-    let ratio = |v: &serde_json::Value| v["b"].as_f64().unwrap() / v["a"].as_f64().unwrap();
-    let far = |c: &Vec3, n: &Vec3| ((c - centre(truth)).norm() * 1e3, n.angle(&normal(truth)).to_degrees());
+    let truth = &e.front["reference"]["ground_truth"];
     for k in ["edges_paper", "edges_polar", "edges_ml_ellipse", "edges_ml_circle"] {
-        let r = &e.traced["reference"][k];
-        let (c, n) = far(&centre(r), &normal(r));
+        let r = &e.front["reference"][k];
+        let (c, n) = far(&centre(r), &normal(r), truth);
         eprintln!("{k:<18} centre {c:.2} mm, normal {n:.2} degrees, axis ratio {:.4}", ratio(r));
     }
     eprintln!("ground truth{:>57.4}", ratio(truth));
-    let (l, r) = (e.traced["clicks_left"].as_array().unwrap(), e.traced["clicks_right"].as_array().unwrap());
-    let mut first: Option<Vec3> = None;
-    for (a, b) in l.iter().zip(r).step_by(5) {
-        let selections = [click(a), click(b)];
-        let p = plan(
-            [&e.pictures[0], &e.pictures[1]],
-            [&selections[0], &selections[1]],
-            &e.rig,
-            &e.gripper,
-            &PlanOptions::default(),
-        )
-        .unwrap();
+    let plans = e.clicked(&e.front, RimChoice::Auto, 5);
+    assert_same(&plans, 5e-5);
+    for p in plans {
         let rim = &p.reconstruction.rim;
-        let (c, n) = far(&rim.centre, &rim.normal);
+        let (c, n) = far(&rim.centre, &rim.normal, truth);
         eprintln!("one click a view   centre {c:.2} mm, normal {n:.2} degrees, axis ratio {:.4}", rim.b / rim.a);
         assert!(c < 0.5 && n < 0.9, "{c} mm {n} degrees");
         assert!(
             (rim.b / rim.a - ratio(truth)).abs() < 0.018,
             "no further from the truth than the reference's closed form"
         );
-        // Whatever place of the rim was clicked, it is the same rim.
-        let f = *first.get_or_insert(rim.centre);
-        assert!((f - rim.centre).norm() < 5e-5);
         assert_eq!(p.file.object.model, "ellipse");
+    }
+}
+
+#[test]
+fn one_click_a_view_finds_the_rear_rim_as_well_as_the_reference_does() {
+    let e = load();
+    let reference = &e.rear["reference"];
+    let truth = &reference["ground_truth"];
+    // The rim is as good as a circle to its edges, and an ellipse by a hundredth to the ground truth: said to be a circle it is a degree off, and admits it.
+    for (choice, model, worst_deg) in [(RimChoice::Ellipse, "ellipse", 0.7), (RimChoice::Auto, "circle", 1.5)] {
+        let plans = e.clicked(&e.rear, choice, 1);
+        assert_same(&plans, 1.5e-3);
+        for p in plans {
+            let (rim, report) = (&p.reconstruction.rim, &p.reconstruction.report);
+            let (c, n) = far(&rim.centre, &rim.normal, truth);
+            let sigma = report.sigma_normal.to_degrees();
+            eprintln!(
+                "{model}: centre {c:.2} mm, normal {n:.2} degrees (sigma {sigma:.2}), axis ratio {:.4}",
+                rim.b / rim.a
+            );
+            assert_eq!(p.file.object.model, model);
+            assert!(c < reference["centre_mm"][0].as_f64().unwrap() && n < worst_deg, "{c} mm {n} degrees");
+            assert!(n < 3.5 * sigma);
+            if choice == RimChoice::Ellipse {
+                assert!((rim.b / rim.a - ratio(truth)).abs() < 0.006);
+            }
+        }
     }
 }
