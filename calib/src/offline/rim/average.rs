@@ -34,3 +34,81 @@ pub(in crate::offline) fn average(r: &mut Reconstruction, other: &Reconstruction
     r.report.sigma_centre = r.cov_centre.trace().sqrt();
     r.report.sigma_normal = r.cov_normal.trace().sqrt();
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::offline::rim::model::{EdgePoint, Options, Outline, RimChoice};
+    use crate::offline::rim::reconstruct::reconstruct;
+    use crate::offline::rim::synthetic::{Random, rig, rim_points, rim_tilted};
+    use nalgebra::{SVector, Vector3};
+
+    /// Centre and normal relative to a circle's, drawn from a reconstruction's own covariance.
+    fn drawn(r: &Reconstruction, from: &Reconstruction, random: &mut Random) -> SVector<f64, 5> {
+        let (f, g) = (frame_of(&r.rim.normal), frame_of(&from.rim.normal));
+        let mut cov = nalgebra::SMatrix::<f64, 5, 5>::zeros();
+        cov.fixed_view_mut::<3, 3>(0, 0).copy_from(&from.cov_centre);
+        cov.fixed_view_mut::<2, 2>(3, 3).copy_from(&from.cov_normal);
+        cov.fixed_view_mut::<3, 2>(0, 3).copy_from(&from.cov_centre_normal);
+        cov.fixed_view_mut::<2, 3>(3, 0).copy_from(&from.cov_centre_normal.transpose());
+        let x = cov.cholesky().unwrap().l() * SVector::<f64, 5>::from_fn(|_, _| random.normal());
+        let centre = from.rim.centre + x.fixed_rows::<3>(0) - r.rim.centre;
+        let normal = from.rim.normal + g.column(0) * x[3] + g.column(1) * x[4] - r.rim.normal;
+        let mut out = SVector::<f64, 5>::zeros();
+        out.fixed_rows_mut::<3>(0).copy_from(&centre);
+        out[3] = f.column(0).dot(&normal);
+        out[4] = f.column(1).dot(&normal);
+        out
+    }
+
+    #[test]
+    fn the_covariance_is_that_of_draws_from_both_models() {
+        let p = rig(0.5, 1200.0, 1.5);
+        let truth = rim_tilted(Vector3::new(0.02, -0.05, 1.5), 0.5, 1.0, 0.075, 0.0745);
+        let mut random = Random::new(9);
+        let points = [0, 1].map(|v| {
+            let place =
+                |uv: nalgebra::Vector2<f64>, r: &mut Random| uv + nalgebra::Vector2::new(r.normal(), r.normal()) * 0.2;
+            let one = |uv, r: &mut Random| EdgePoint { uv: place(uv, r), sigma: 0.2, outline: Outline::Outer };
+            rim_points(&p[v], &truth, 200).into_iter().map(|uv| one(uv, &mut random)).collect::<Vec<_>>()
+        });
+        let fit = |rim| {
+            let o = Options { rim, ..Options::default() }.tolerating_anything();
+            reconstruct(&points[0], &p[0], &points[1], &p[1], &o).unwrap()
+        };
+        let (circle, ellipse) = (fit(RimChoice::Circle), fit(RimChoice::Ellipse));
+        const N: usize = 40_000;
+        let mut sum = nalgebra::SMatrix::<f64, 5, 5>::zeros();
+        for n in 0..N {
+            let x = drawn(&circle, if n % 4 == 0 { &ellipse } else { &circle }, &mut random);
+            sum += x * x.transpose() / N as f64;
+        }
+        let mut both = circle.clone();
+        average(&mut both, &ellipse, 0.25);
+        assert!(both.report.sigma_normal > 1.2 * circle.report.sigma_normal, "the models differ");
+        let close = |a: f64, b: f64, size: f64| assert!((a - b).abs() < 0.05 * size, "{a:e} against {b:e}");
+        for i in 0..3 {
+            for j in 0..3 {
+                close(both.cov_centre[(i, j)], sum[(i, j)], (sum[(i, i)] * sum[(j, j)]).sqrt());
+            }
+            for j in 0..2 {
+                close(both.cov_centre_normal[(i, j)], sum[(i, 3 + j)], (sum[(i, i)] * sum[(3 + j, 3 + j)]).sqrt());
+            }
+        }
+        for i in 0..2 {
+            for j in 0..2 {
+                close(both.cov_normal[(i, j)], sum[(3 + i, 3 + j)], (sum[(3 + i, 3 + i)] * sum[(3 + j, 3 + j)]).sqrt());
+            }
+        }
+    }
+
+    #[test]
+    fn the_share_is_a_probability_and_missing_where_the_ellipse_won() {
+        let score = |model, bic| Score { model, chi2: 1.0, parameters: 6, bic, excluded: None };
+        let share = |e| share_of_ellipse(&[score(RimModel::Circle, 100.0), score(RimModel::Ellipse, e)]);
+        assert_eq!(share(100.0), Some(0.5));
+        assert!(share(110.0).is_some_and(|s| (s - 0.0067).abs() < 1e-4));
+        assert_eq!(share(99.0), None);
+        assert_eq!(share_of_ellipse(&[score(RimModel::Circle, 100.0)]), None);
+    }
+}
