@@ -22,7 +22,7 @@ pub fn html(plan: &Plan, picture: Option<&[u8]>) -> String {
     let o = &plan.file.object;
     let r = &plan.reconstruction;
     let mut h = head(
-        &format!("Grasp on a {}", o.model),
+        &format!("Grasp on a{} {}", if o.model.starts_with('e') { "n" } else { "" }, o.model.replace('-', " ")),
         plan.set_point.id,
         &plan.file.warnings,
         picture.map(|png| (png, "both views with rim, normal, gripper and marks")),

@@ -216,6 +216,12 @@ fn solve(slope: &[f64; SLOPES], width: f64, fit: &mut Fit) -> Option<()> {
         let (mut a, mut g) = (SMatrix::<f64, N, N>::zeros(), SVector::<f64, N>::zeros());
         let steps = 2 * fit.count;
         let uses = |k: usize| k < steps || (k >= SHADE && fit.is_shaded());
+        let (mut used, mut count) = ([0usize; N], 0);
+        for k in (0..N).filter(|k| uses(*k)) {
+            used[count] = k;
+            count += 1;
+        }
+        let used = &used[..count];
         for (i, (left, sample)) in fit.left.iter().zip(samples).enumerate() {
             let mut d = [0.0; N];
             for k in 0..fit.count {
@@ -228,10 +234,11 @@ fn solve(slope: &[f64; SLOPES], width: f64, fit: &mut Fit) -> Option<()> {
                 d[SHADE] = 1.0 - sample.bright;
                 d[SHADE + 1] = sample.bright;
             }
-            for (p, dp) in d.iter().enumerate().filter(|(p, _)| uses(*p)) {
-                g[p] += dp * left;
-                for (q, dq) in d.iter().enumerate().filter(|(q, _)| uses(*q)) {
-                    a[(q, p)] += dq * dp;
+            // The lower triangle is all that Cholesky's method reads.
+            for (n, p) in used.iter().enumerate() {
+                g[*p] += d[*p] * left;
+                for q in &used[n..] {
+                    a[(*q, *p)] += d[*q] * d[*p];
                 }
             }
         }
