@@ -87,6 +87,10 @@ fn sharpened(
         let (gap_px, gap_sigma_px) = (r.gap_px, r.gap_sigma_px);
         return Err(Refusal::Mismatch { gap_px, gap_sigma_px, excess: r.excess, limit, delta: r.delta });
     }
+    let chi2_per_dof = chi2_per_dof(&reconstruction);
+    if chi2_per_dof > UNLIKE {
+        return Err(Refusal::Unlike { chi2_per_dof, limit: UNLIKE });
+    }
     // A gap that nobody knows closes on anything.
     let loosest = r.gap_sigma_px.into_iter().filter(|s| s.is_finite()).fold(0.0, f64::max);
     if loosest > LOOSE_PX {
@@ -117,6 +121,10 @@ const DECISIVE: f64 = 60.0;
 
 /// Chi-squared per degree of freedom up to which a rim is clean.
 const CLEAN: f64 = 1.6;
+
+/// Chi-squared per degree of freedom above which edges do not lie on one plane rim. Plane rims of 300 rendered worlds stay below two, contours of unlike things that
+/// pass every other test are at five and more.
+const UNLIKE: f64 = 4.0;
 
 /// Uncertainty of the epipolar tangents, pixels, above which two arcs cannot be held against each other. Whole rims are at a hundredth, ones hidden by a third at a
 /// third of it.
@@ -209,9 +217,13 @@ impl Pair {
     }
 }
 
+fn chi2_per_dof(r: &Reconstruction) -> f64 {
+    r.report.chi2 / r.report.dof.max(1) as f64
+}
+
 /// Whether the edges lie on the rim as closely as their noise lets them.
 fn is_clean(r: &Reconstruction) -> bool {
-    r.report.chi2 / r.report.dof.max(1) as f64 <= CLEAN
+    chi2_per_dof(r) <= CLEAN
 }
 
 /// Whether they do, and the rim is a circle.

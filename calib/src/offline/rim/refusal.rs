@@ -106,6 +106,16 @@ pub enum Refusal {
         /// Its limit.
         limit_px: f64,
     },
+    /// The edges of both views do not lie on one rim as closely as they say.
+    #[error(
+        "the edges do not lie on one rim of both views: {chi2_per_dof:.1} times the squared scatter that their own uncertainty allows (limit {limit:.1}): something else runs along the contour; click one that stands alone, or several points of the one that is meant"
+    )]
+    Unlike {
+        /// Chi-squared per degree of freedom.
+        chi2_per_dof: f64,
+        /// Its limit.
+        limit: f64,
+    },
     /// The pencil of the cones has no real pair of planes.
     #[error(
         "the two viewing cones have no real pair of planes in common ({why}): click the same contour in both pictures, or move the rig off the rim's axis"
