@@ -67,8 +67,10 @@ impl Example {
         let (l, r) = (rim["clicks_left"].as_array().unwrap(), rim["clicks_right"].as_array().unwrap());
         let mut options = PlanOptions::default();
         options.rim.rim = choice;
-        options.rim.max_sigma_centre = Some(0.01);
-        options.rim.max_sigma_normal = 3f64.to_radians();
+        if choice == RimChoice::Ellipse {
+            // Two thirds of a rim that is nearly round leave an ellipse's normal to 2.7 degrees.
+            options.rim.max_sigma_normal = 3f64.to_radians();
+        }
         let one = |(a, b)| {
             let selections = [click(a), click(b)];
             plan(

@@ -312,7 +312,7 @@ fn busy_seconds() -> f64 {
 }
 
 #[test]
-fn large_scans_of_anything_end_soon() {
+fn large_scans_of_anything_take_less_than_two_seconds() {
     let f = Folder::new("large", &JAW);
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(4);
     // A ball, a tall vase of changing radius, and a ring: hundreds of small nearly flat patches.
@@ -340,7 +340,7 @@ fn large_scans_of_anything_end_soon() {
         let rows = f.list(&path);
         let took = busy_seconds() - from;
         println!("{name} of {radius} mm: {} triangles, {} handles, {took:.2} s", t.len(), rows.len());
-        // Of this thread's own work, whatever runs beside it; several times what is asked for, as a bound on runaway searches: how long it takes is a benchmark's to tell.
-        assert!(took < 10.0, "{name}: {took:.2} s");
+        // Twice what is asked for, of this thread's own work: what runs beside it does not count.
+        assert!(took < 4.0, "{name}: {took:.2} s");
     }
 }

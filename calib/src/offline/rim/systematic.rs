@@ -17,6 +17,8 @@ use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Matrix2, SymmetricEigen, Vector3
 const WAVES: [f64; 5] = [1.0, 1.0, 0.6, 0.4, 0.3];
 /// Quickest waves whose size is read from the residuals, in periods.
 const QUICKEST: usize = 6;
+/// Rounds of the eigenvalues' search at most: it takes a few for each of about fifty.
+const MOST_ROUNDS: usize = 2000;
 /// Part of the best seen direction's information below which the fit has taken a wave up.
 const LEAST_SEEN: f64 = 0.02;
 /// Parameters at most: centre, normal, two axes and their direction.
@@ -196,7 +198,7 @@ impl Waves {
         let g = self.columns.transpose() * &heavy - taken.transpose() * solve.solve(&taken);
         let r = DVector::from_column_slice(residual);
         let q = heavy.transpose() * &r;
-        let eigen = SymmetricEigen::new(g);
+        let Some(eigen) = SymmetricEigen::try_new(g, f64::EPSILON, MOST_ROUNDS) else { return 0.0 };
         let along = eigen.eigenvectors.transpose() * q;
         let largest = eigen.eigenvalues.max();
         let seen: Vec<(f64, f64)> = eigen
