@@ -6,7 +6,7 @@ use crate::offline::drawing::overlay;
 use crate::offline::drawing::report;
 use crate::offline::edges::picture::Picture;
 use crate::offline::handle::grasp::Approach;
-use crate::offline::pairs::propose::Proposal;
+use crate::offline::decide::propose::Proposal;
 use crate::offline::plan::{Plan, PlanError, PlanOptions, model_name, plan, plan_proposal, proposals};
 use crate::offline::rim::model::RimChoice;
 use graspd_rt::geom::{Pixel, Pose};

@@ -21,7 +21,7 @@ pub use hash::ContentHash;
 pub use mesh::{Pick, PicksFile, PoseFile};
 pub use plan::{
     CandidateRecord, ConeRecord, EdgeRecord, GoalRecord, GripRecord, MarkRecord, MeshRecord, ModelRecord, ObjectRecord,
-    PathRecord, PickRecord, PictureRecord, PlanFile, SelectionRecord, SourceRecord, ViewPair,
+    PathRecord, PickRecord, PictureRecord, PlanFile, SeenCamera, SeenRig, SelectionRecord, SourceRecord, ViewPair,
 };
 pub use pose::PoseRecord;
 pub use rig::{Quality, RigFile};

@@ -5,7 +5,7 @@ use super::gripper::GripperFile;
 use super::hash::ContentHash;
 use super::pose::PoseRecord;
 use super::rig::RigFile;
-use graspd_rt::geom::{Pixel, Pose, View};
+use graspd_rt::geom::{Camera, Pixel, Pose, Rig, View};
 use graspd_rt::gripper::MAX_MARKS;
 use graspd_rt::setpoint::{Goal, SetPoint};
 use nalgebra::Point3;
@@ -222,6 +222,95 @@ pub struct PickRecord {
     pub right_px: [f64; 2],
 }
 
+/// A camera as the images of the plan had it.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SeenCamera {
+    /// Focal lengths, pixels.
+    pub focal_px: [f64; 2],
+    /// Principal point, pixels.
+    pub principal_px: [f64; 2],
+}
+
+/// The rig as the images of the plan had it: the rig file with its error put right as far as the images show it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SeenRig {
+    /// The left camera.
+    pub left: SeenCamera,
+    /// The right camera.
+    pub right: SeenCamera,
+    /// Pose of the left camera's frame in the right camera's.
+    pub right_from_left: PoseRecord,
+    /// Epipolar displacement of the rig file against the images, root mean square, pixels.
+    pub epipolar_px: f64,
+    /// Matches that it was measured on.
+    pub matches: usize,
+}
+
+/// Most that a focal length may differ from the rig file, relative: more is another camera.
+const MOST_FOCAL: f64 = 0.05;
+/// Most that a principal point may differ, pixels.
+const MOST_PRINCIPAL_PX: f64 = 30.0;
+/// Most that the right camera may be turned against the rig file, radians (2 degrees).
+const MOST_TURN_RAD: f64 = 0.035;
+/// Most that it may have moved, as a fraction of the baseline.
+const MOST_MOVE: f64 = 0.05;
+
+impl SeenRig {
+    /// The record of a rig.
+    pub fn of(rig: &Rig, epipolar_px: f64, matches: usize) -> Self {
+        let camera =
+            |c: &Camera| SeenCamera { focal_px: [c.fx, c.fy], principal_px: [c.cx, c.cy] };
+        Self {
+            left: camera(&rig.left),
+            right: camera(&rig.right),
+            right_from_left: PoseRecord::of(&rig.right_from_left),
+            epipolar_px,
+            matches,
+        }
+    }
+
+    /// The rig, with the lenses of the rig file; refused where it is not the rig file's rig within an error of calibration.
+    fn rig(&self, src: &Source<'_>, file: &Rig) -> Result<Rig, FileError> {
+        let mut out = *file;
+        for (key, seen, camera) in
+            [("left", &self.left, &mut out.left), ("right", &self.right, &mut out.right)]
+        {
+            let focal = (seen.focal_px[0] / camera.fx - 1.0).abs().max((seen.focal_px[1] / camera.fy - 1.0).abs());
+            let off = (seen.principal_px[0] - camera.cx).abs().max((seen.principal_px[1] - camera.cy).abs());
+            for (leaf, values, good) in [
+                ("focal_px", seen.focal_px, focal <= MOST_FOCAL),
+                ("principal_px", seen.principal_px, off <= MOST_PRINCIPAL_PX),
+            ] {
+                if !good {
+                    return Err(src.refuse(
+                        &format!("seen_rig.{key}.{leaf}"),
+                        values,
+                        "too far from the rig file for an error of its calibration",
+                        "the file was altered or damaged: make the plan again",
+                    ));
+                }
+            }
+            [camera.fx, camera.fy] = seen.focal_px;
+            [camera.cx, camera.cy] = seen.principal_px;
+        }
+        let pose = self.right_from_left.pose(src, "seen_rig.right_from_left", 1e3)?;
+        let turned = pose.rotation.angle_to(&file.right_from_left.rotation);
+        out.right_from_left = pose;
+        let moved = (out.centre(View::Right) - file.centre(View::Right)).norm();
+        if !(turned <= MOST_TURN_RAD && moved <= MOST_MOVE * file.centre(View::Right).norm()) {
+            return Err(src.refuse(
+                "seen_rig.right_from_left",
+                self.right_from_left.translation_m,
+                "too far from the rig file for an error of its calibration",
+                "the file was altered or damaged: make the plan again",
+            ));
+        }
+        Ok(out)
+    }
+}
+
 /// A mark at a goal.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -301,6 +390,9 @@ pub struct PlanFile {
     /// The edges and ellipses of both views.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub edges: Option<ViewPair<EdgeRecord>>,
+    /// The rig that the marks were predicted with, where it is not the rig file's to the letter.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub seen_rig: Option<SeenRig>,
     /// The two cones.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cones: Option<ConeRecord>,
@@ -406,7 +498,8 @@ impl PlanFile {
                 });
             }
         }
-        let goal = |key: &str, g: &GoalRecord| self.goal(&src, key, g, rig.1, gripper.1);
+        let seen = self.seen_rig.as_ref().map_or(Ok(rig.1.rig), |s| s.rig(&src, &rig.1.rig))?;
+        let goal = |key: &str, g: &GoalRecord| self.goal(&src, key, g, &seen, gripper.1);
         Ok(SetPoint {
             id: ContentHash::of(text.as_bytes()).short(),
             pregrasp: goal("pregrasp", &self.pregrasp)?,
@@ -422,7 +515,7 @@ impl PlanFile {
         src: &Source<'_>,
         key: &str,
         g: &GoalRecord,
-        rig: &RigFile,
+        rig: &Rig,
         gripper: &GripperFile,
     ) -> Result<Goal, FileError> {
         let left_from_gripper: Pose = g.left_from_gripper.pose(src, &format!("{key}.left_from_gripper"), 1e3)?;
@@ -440,7 +533,7 @@ impl PlanFile {
             for (view, px, leaf) in [(View::Left, m.left_px, "left_px"), (View::Right, m.right_px, "right_px")] {
                 let Some(px) = px else { continue };
                 let given = Pixel::new(px[0], px[1]);
-                let off = rig.rig.project(view, &x).map_or(f64::INFINITY, |p| (p - given).norm());
+                let off = rig.project(view, &x).map_or(f64::INFINITY, |p| (p - given).norm());
                 if !(off <= MARK_TOLERANCE_PX) {
                     return Err(src.refuse(
                         &format!("{key}.mark.{leaf}"),

@@ -2,20 +2,21 @@
 
 use crate::files::{
     ConeRecord, EdgeRecord, FileError, GoalRecord, GripperFile, MarkRecord, ModelRecord, ObjectRecord, PathRecord,
-    PictureRecord, PlanFile, PoseRecord, RigFile, SelectionRecord, SourceRecord, ViewPair,
+    PictureRecord, PlanFile, PoseRecord, RigFile, SeenRig, SelectionRecord, SourceRecord, ViewPair,
 };
 use crate::offline::contour::select::{self, Candidate, SelectError, Selection};
 use crate::offline::contour::{Contour, ViewEdges};
-use crate::offline::edges::lens::projection;
+use crate::offline::edges::lens::{Lens, projection};
 use crate::offline::edges::picture::Picture;
 use crate::offline::handle::grasp::{self, Approach, Grasp, GraspError, object_frame};
 use crate::offline::handle::setpoint::{RimObstacle, Scene, fewest_on_the_way};
-use crate::offline::pairs::order::{self, Votes};
-use crate::offline::pairs::pairing::{self, Pair};
-use crate::offline::pairs::propose::{Proposal, propose};
-use crate::offline::rim::model::{self, Projection, Reconstruction, RimModel};
+use crate::offline::correspondence::rig_error::{RigError, RigPrior};
+use crate::offline::correspondence::spots::{Votes, spots};
+use crate::offline::decide::pairing::{self, Pair};
+use crate::offline::decide::propose::{Proposal, propose};
+use crate::offline::rim::model::{self, Reconstruction, RimModel};
 use crate::offline::rim::refusal::Refusal;
-use graspd_rt::geom::{Pose, View};
+use graspd_rt::geom::{Pose, Rig, View};
 use graspd_rt::setpoint::{Goal, SetPoint};
 
 /// How many contours of a view are tried against the other's.
@@ -28,6 +29,8 @@ pub struct PlanOptions {
     pub rim: model::Options,
     /// Of the approach.
     pub approach: Approach,
+    /// What the rig file may have wrong.
+    pub rig: RigPrior,
 }
 
 impl Default for PlanOptions {
@@ -36,6 +39,7 @@ impl Default for PlanOptions {
         Self {
             rim: model::Options { calibration_px: 1.0, edge_bias_px: 0.1, ..model::Options::default() },
             approach: Approach::default(),
+            rig: RigPrior::default(),
         }
     }
 }
@@ -133,15 +137,21 @@ impl PlanError {
 #[derive(Debug)]
 pub struct Prepared<'a> {
     pub(super) edges: [ViewEdges<'a>; 2],
-    pub(super) p: [Projection; 2],
+    /// The rig as the images have it, and what stays unknown of it.
+    pub(super) seen: RigError,
     pictures: [&'a Picture; 2],
     rig: &'a RigFile,
-    votes: std::cell::OnceCell<Votes>,
+    votes: Votes,
 }
 
 impl<'a> Prepared<'a> {
-    /// Checks the pictures' sizes and finds their edges.
+    /// The same for a rig of unstated quality.
     pub fn new(pictures: [&'a Picture; 2], rig: &'a RigFile) -> Result<Self, PlanError> {
+        Self::with_prior(pictures, rig, &RigPrior::default())
+    }
+
+    /// Checks the images' sizes, holds the images against the rig file, and finds their edges.
+    pub fn with_prior(pictures: [&'a Picture; 2], rig: &'a RigFile, prior: &RigPrior) -> Result<Self, PlanError> {
         for (view, picture, name) in [(View::Left, pictures[0], "left"), (View::Right, pictures[1], "right")] {
             let c = rig.rig.camera(view);
             if (picture.width(), picture.height()) != (c.width as usize, c.height as usize) {
@@ -154,21 +164,27 @@ impl<'a> Prepared<'a> {
                 });
             }
         }
-        let edges = View::BOTH.map(|v| ViewEdges::new(pictures[v.index()], rig.rig.camera(v)));
+        let lenses = View::BOTH.map(|v| Lens::new(rig.rig.camera(v)));
         let p = View::BOTH.map(|v| projection(&rig.rig, v));
-        Ok(Self { edges, p, pictures, rig, votes: std::cell::OnceCell::new() })
+        let noise = pictures[0].noise().max(pictures[1].noise());
+        let t0 = std::time::Instant::now();
+        let found = spots(pictures, [&lenses[0], &lenses[1]], [&p[0], &p[1]], noise);
+        let seen = RigError::observe(&rig.rig, prior, &found.matches);
+        if std::env::var("DBG").is_ok() {
+            eprintln!("  spots {:.1} ms {:?} unknown {:.3} phi-size {:.3}", t0.elapsed().as_secs_f64() * 1e3, seen.seen, seen.unknown_px(), seen.spread());
+        }
+        let edges = View::BOTH.map(|v| ViewEdges::new(pictures[v.index()], seen.rig.camera(v)));
+        Ok(Self { edges, seen, pictures, rig, votes: found.votes })
     }
 
-    /// How the pictures' spots vote on their order; taken once.
+    /// How the images' spots vote on their order.
     pub fn order(&self) -> Votes {
-        *self.votes.get_or_init(|| self.vote())
+        self.votes
     }
 
-    /// Lets them vote.
-    pub fn vote(&self) -> Votes {
-        let [l, r] = &self.edges;
-        let noise = l.map.noise().max(r.map.noise());
-        order::votes(self.pictures, [&l.lens, &r.lens], [&self.p[0], &self.p[1]], noise)
+    /// How the images and the rig file agree.
+    pub fn rig_error(&self) -> &RigError {
+        &self.seen
     }
 
     /// Refuses pictures in the wrong order.
@@ -219,8 +235,7 @@ impl<'a> Prepared<'a> {
         let [l, r] = &self.edges;
         let left = select::contours(View::Left, l, selections[1], 2).ok()?;
         let right = select::contours(View::Right, r, selections[0], 2).ok()?;
-        let p = [&self.p[0], &self.p[1]];
-        pairing::pair([l, r], [&left, &right], p, &options.rim).err().filter(|u| u.swapped_fits).map(|u| u.refusal)
+        pairing::pair([l, r], [&left, &right], &self.seen, &options.rim).err().filter(|u| u.swapped_fits).map(|u| u.refusal)
     }
 }
 
@@ -232,7 +247,7 @@ pub fn plan(
     gripper: &GripperFile,
     options: &PlanOptions,
 ) -> Result<Plan, PlanError> {
-    Prepared::new(pictures, rig)?.plan(selections, gripper, options)
+    Prepared::with_prior(pictures, rig, &options.rig)?.plan(selections, gripper, options)
 }
 
 /// Ellipses proposed without a selection, ranked, at most `most`.
@@ -242,9 +257,9 @@ pub fn proposals(
     options: &PlanOptions,
     most: usize,
 ) -> Result<Vec<Proposal>, PlanError> {
-    let views = Prepared::new(pictures, rig)?;
+    let views = Prepared::with_prior(pictures, rig, &options.rig)?;
     views.in_order()?;
-    Ok(propose(&views.edges, [&views.p[0], &views.p[1]], &options.rim, most))
+    Ok(propose(&views.edges, [&views.seen.p[0], &views.seen.p[1]], &options.rim, most))
 }
 
 /// Plans a grasp on a proposal.
@@ -255,7 +270,7 @@ pub fn plan_proposal(
     gripper: &GripperFile,
     options: &PlanOptions,
 ) -> Result<Plan, PlanError> {
-    let views = Prepared::new(pictures, rig)?;
+    let views = Prepared::with_prior(pictures, rig, &options.rig)?;
     let [left, right] = proposal.candidates();
     let record = [0, 1].map(|k| SelectionRecord {
         kind: "auto".to_owned(),
@@ -275,23 +290,24 @@ pub(super) fn from_candidates(
     // A rim near the middle can be reconstructed either way round; the rest of the pictures tells.
     views.in_order()?;
     let (pictures, rig) = (views.pictures, views.rig);
-    let p = [&views.p[0], &views.p[1]];
-    let found = pairing::pair([&views.edges[0], &views.edges[1]], candidates, p, &options.rim).map_err(|u| {
+    let found = pairing::pair([&views.edges[0], &views.edges[1]], candidates, &views.seen, &options.rim).map_err(|u| {
         if u.swapped_fits && !views.order().are_as_given() {
             PlanError::Swapped { as_given: u.refusal }
         } else {
             PlanError::Rim(u.refusal)
         }
     })?;
-    let Pair { contours, inner, reconstruction, .. } = found;
-    let grasp = grasp::choose(&rig.rig, gripper, &reconstruction, &options.approach)?;
-    let mut plan = assemble(contours, inner, reconstruction, grasp, rig, gripper, options);
+    let Pair { contours, inner, reconstruction, rig: seen, .. } = found;
+    let matches = views.seen.seen;
+    let grasp = grasp::choose(&seen, gripper, &reconstruction, &options.approach)?;
+    let mut plan = assemble((contours, inner), reconstruction, grasp, (rig, &seen), gripper, options);
     plan.file.pictures = Some(pair_of(pictures.map(|p| PictureRecord {
         hash: p.hash().to_string(),
         width: p.width() as u32,
         height: p.height() as u32,
     })));
     plan.file.selection = Some(pair_of(selection));
+    plan.file.seen_rig = Some(SeenRig::of(&seen, matches.as_given_px, matches.agreeing));
     finish(plan, rig, gripper)
 }
 
@@ -308,11 +324,10 @@ fn finish(mut plan: Plan, rig: &RigFile, gripper: &GripperFile) -> Result<Plan, 
 }
 
 fn assemble(
-    contours: [Contour; 2],
-    inner: [Option<Contour>; 2],
+    (contours, inner): ([Contour; 2], [Option<Contour>; 2]),
     reconstruction: Reconstruction,
     grasp: Grasp,
-    rig: &RigFile,
+    (rig, seen): (&RigFile, &Rig),
     gripper: &GripperFile,
     options: &PlanOptions,
 ) -> Plan {
@@ -320,7 +335,7 @@ fn assemble(
     let rim = reconstruction.rim;
     let obstacle = RimObstacle { centre: rim.centre, normal: rim.normal, radius };
     let opening = grasp.opening.min(gripper.opening[1]);
-    let scene = Scene::new(&rig.rig, gripper, opening, Some(&obstacle));
+    let scene = Scene::new(seen, gripper, opening, Some(&obstacle));
     let mut warnings = grasp.warnings.clone();
     let path = options.approach.present.map(|present| {
         let poses = [present, grasp.pregrasp, grasp.grasp];
@@ -360,6 +375,7 @@ fn assemble(
         pictures: None,
         selection: None,
         edges: Some(pair_of([0, 1].map(|k| edge_record(&contours[k])))),
+        seen_rig: None,
         cones: Some(cone_record(&reconstruction)),
         mesh: None,
         model: model_records(&reconstruction),

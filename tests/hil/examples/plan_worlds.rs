@@ -12,7 +12,14 @@ use serde_json::json;
 
 /// What a kind of cell is drawn with.
 fn options(kind: &str) -> Option<Options> {
-    let alone = Options { with_arm: false, ..Options::default() };
+    let error = std::env::var("RIG_ERROR").unwrap_or_default();
+    let (focal, deg) = error.split_once(':').unwrap_or(("0", "0"));
+    let alone = Options {
+        with_arm: false,
+        focal_error: focal.parse::<f64>().unwrap_or(0.0) / 100.0,
+        rotation_error_deg: deg.parse().unwrap_or(0.0),
+        ..Options::default()
+    };
     let paint = Options { core_radius_m: [0.0715, 0.0715], rim_occlusion: 0.3, tilt_deg: [5.0, 40.0], ..alone };
     Some(match kind {
         "paint" => paint,

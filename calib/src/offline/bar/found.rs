@@ -1,12 +1,8 @@
 //! A bar that was found, and by how much its outlines are those of a bar rather than the edges of something flat.
 
-use crate::offline::conic::robust::{GATE, median};
 use crate::offline::contour::Contour;
-use crate::offline::rim::model::{EdgePoint, Options, Outline, Projection, Reconstruction, RimChoice, RimModel};
-use crate::offline::rim::reconstruct::reconstruct;
+use crate::offline::rim::model::{EdgePoint, Outline, Reconstruction};
 
-/// How far from parallel the planes of a flat ring's two edges may seem, radians (0.15 degrees).
-const PARALLEL_RAD: f64 = 0.0026;
 /// Most that an outline may leave the bar, pixels (root mean square): more, and it is something else that was followed.
 const MOST_SCATTER_PX: f64 = 0.45;
 /// The fewer edges an outline has, the closer they have to keep to it: what may leave it, pixels, for a share of next to none, and more for each share.
@@ -78,41 +74,5 @@ impl BarFound {
         let (scatter, part) = self.kept();
         let limit = MOST_SCATTER_PX.min(SCATTER_AT_NONE + SCATTER_PER_PART * part);
         scatter <= limit && part >= LEAST_PART && r.noise <= MOST_NOISE && used * 10 >= all * 7
-    }
-
-    /// By how much the information criterion of two plane rims, one an outline, exceeds that of the bar on the same points: positive for a bar.
-    pub(in crate::offline) fn evidence(&self, p: [&Projection; 2], options: &Options) -> f64 {
-        let r = &self.reconstruction;
-        let sigmas = [self.points(0), self.points(1)];
-        let bar: Vec<f64> =
-            (0..2).flat_map(|k| r.report.residuals[k].iter().zip(&sigmas[k]).map(|(d, q)| d / q.sigma)).collect();
-        // Each outline a rim of its own, whatever the rig's doubt: it is the shape that is compared.
-        let lenient = Options { rim: RimChoice::Edge, calibration_px: 20.0, max_noise_px: 3.0, ..*options };
-        let mut flat = Vec::new();
-        let mut parameters = 0u32;
-        let mut normals = Vec::new();
-        for (contours, kind) in [(&self.outer, Outline::Outer), (&self.inner, Outline::Outer)] {
-            let [a, b] = [0, 1].map(|k| contours[k].edge_points(kind));
-            let Ok(rim) = reconstruct(&a, p[0], &b, p[1], &lenient) else { return f64::INFINITY };
-            normals.push((rim.rim.normal, rim.report.sigma_normal));
-            parameters += if rim.model == RimModel::Circle { 6 } else { 8 };
-            for (k, points) in [a, b].iter().enumerate() {
-                flat.extend(rim.report.residuals[k].iter().zip(points).map(|(d, q)| d / q.sigma));
-            }
-        }
-        let scale = |v: &[f64]| 1.48 * median(v.iter().map(|d| d.abs()).collect());
-        let noise = scale(&bar).min(scale(&flat)).max(1e-6);
-        let most = GATE * noise;
-        let sum = |v: &[f64]| -> f64 {
-            v.iter().map(|d| if d.is_finite() { d.abs().min(most).powi(2) } else { most * most }).sum::<f64>()
-                / (noise * noise)
-        };
-        let each = (bar.len().max(1) as f64).ln();
-        // The edges of a flat ring lie in parallel planes; the outlines of a bar seem to lie in planes tipped opposite ways.
-        let tipped = match normals.as_slice() {
-            [(n, s), (m, t)] => (n.angle(m) / s.hypot(*t).hypot(PARALLEL_RAD)).powi(2),
-            _ => 0.0,
-        };
-        (sum(&flat) + tipped + f64::from(parameters) * each) - (sum(&bar) + 7.0 * each)
     }
 }

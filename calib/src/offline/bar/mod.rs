@@ -12,7 +12,7 @@ pub mod torus;
 
 use crate::offline::bar::torus::{Free, Ray, Torus, TorusFit, fit, rays};
 use crate::offline::conic::robust::{GATE, median};
-use crate::offline::pairs::correspondence::excess_limit;
+use crate::offline::correspondence::tangency::excess_limit;
 use crate::offline::rim::circle::{check_front, frame_of, signed_axis, vergence};
 use crate::offline::rim::model::{
     EdgePoint, Noise, Options, Outline, Projection, Reconstruction, Rim, RimModel, Score,
@@ -139,7 +139,7 @@ fn start(
     outer: &Analysis,
     options: &Options,
 ) -> Result<(Torus, bool), Refusal> {
-    let rim = plane_rim(outer).ok_or_else(|| {
+    let rim = outer.any_rim().ok_or_else(|| {
         outer.verdict.clone().err().unwrap_or(Refusal::NoFit { why: "the outer outline gives no start" })
     })?;
     let inside = points.map(|v| v.iter().filter(|q| q.outline == Outline::Inner).copied().collect::<Vec<_>>());
@@ -156,7 +156,7 @@ fn start(
     let has_inner = inside.iter().all(|v| v.len() >= 10);
     if has_inner
         && let Ok(a) = analyse([&inside[0], &inside[1]], p, options)
-        && let Some(hole) = plane_rim(&a)
+        && let Some(hole) = a.any_rim()
     {
         let small = (hole.a * hole.b).sqrt();
         let r = bar.unwrap_or(0.5 * (radius - small)).max(0.01 * radius);
@@ -172,13 +172,6 @@ fn start(
     }
     let r = bar.unwrap_or(0.1 * radius);
     Ok((Torus { centre: rim.centre, normal: rim.normal, core: radius - r, bar: r }, has_inner))
-}
-
-/// Any plane rim that the analysis offers, the circle first: the outline of a bar is nearly round and a circle is stiffer.
-fn plane_rim(a: &Analysis) -> Option<Rim> {
-    let fits = [&a.circle, &a.ellipse].into_iter().filter_map(|f| f.as_ref().ok()).map(|f| f.rim);
-    let closed = [&a.polar, &a.paper].into_iter().filter_map(|f| f.as_ref().ok()).map(|f| f.rim);
-    fits.chain(closed).next()
 }
 
 /// Turns a fit into a result, or refuses it: two-view test, side, covariance.

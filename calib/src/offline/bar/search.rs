@@ -21,13 +21,15 @@ pub(in crate::offline) struct Search {
     pub(in crate::offline) found: Vec<BarFound>,
     /// Support of the best guess, followed or not (1.5 where the other outline is seen whole in both views).
     pub(in crate::offline) support: f64,
-    /// By how much a guess, followed or not, is better supported than most thicknesses are: above [`SUPPORTED`] a bar is not out of the question.
-    pub(in crate::offline) excess: f64,
+    /// Part of the other outline that carries edges at the best-supported thickness, and at the usual one.
+    pub(in crate::offline) seen: f64,
+    pub(in crate::offline) usual: f64,
+    /// Number of thicknesses that were tried.
+    pub(in crate::offline) tried: f64,
 }
 
-/// Excess of support from which the other outline of a bar seems to be there. Among much else in a picture any thickness has some support: a wheel's
-/// flanges, tyre and brake give 0.7 of it on the median, and 1.3 at the flange; a bar's other outline stands out by more than one.
-pub(in crate::offline) const SUPPORTED: f64 = 0.7;
+/// Support of an outline that is seen whole in both views.
+const WHOLE: f64 = 1.5;
 
 /// Thinnest and thickest picture of a bar, in parts of the outline's semi-major axis.
 const WIDTH: [f64; 2] = [0.05, 0.65];
@@ -53,8 +55,8 @@ struct Guess {
     worth: f64,
     /// How likely the edges are the other outline: strong ones count for more.
     likely: f64,
-    /// By how much it is worth more than the median thickness.
-    excess: f64,
+    /// What the median thickness is worth.
+    usual: f64,
 }
 
 /// Where a clean circle was clicked, only a guess this likely, in parts of the likeliest, is followed up besides it: a bright bar's shading may be the equal of
@@ -70,17 +72,20 @@ pub(in crate::offline) fn find(
     options: &Options,
     clean: bool,
 ) -> Search {
-    let mut search = Search { found: Vec::new(), support: 0.0, excess: 0.0 };
+    let mut search = Search { found: Vec::new(), support: 0.0, seen: 0.0, usual: 0.0, tried: 0.0 };
     let Some(eyes) = camera_centre(p[0]).zip(camera_centre(p[1])) else { return search };
     let views = [View::new(views[0], clicked[0], p[0], eyes.0), View::new(views[1], clicked[1], p[1], eyes.1)];
-    let guesses = guesses(&views, clicked, plane, options);
+    let (guesses, tried) = guesses(&views, clicked, plane, options);
+    search.tried = tried as f64;
     let likeliest = guesses.first().map_or(0.0, |g| g.likely);
     for g in guesses {
         if clean && g.likely < AS_LIKELY * likeliest {
             break;
         }
         search.support = search.support.max(g.worth);
-        search.excess = search.excess.max(g.excess);
+        if g.worth / WHOLE > search.seen {
+            (search.seen, search.usual) = (g.worth / WHOLE, g.usual / WHOLE);
+        }
         let Some(bar) = settle(&views, g.torus, g.worth, options) else { continue };
         // Two guesses often lead to one bar.
         let same = |b: &BarFound| {
@@ -106,13 +111,13 @@ fn guesses(
     clicked: [&Contour; 2],
     (centre, normal, radius): (Vector3<f64>, Vector3<f64>, f64),
     options: &Options,
-) -> Vec<Guess> {
+) -> (Vec<Guess>, usize) {
     let thin = |c: &Contour, v: &View<'_, '_>| -> Option<Vec<Ray>> {
         let step = (c.points.len() / 40).max(1);
         let points: Vec<EdgePoint> = c.points.iter().step_by(step).map(|p| p.edge).collect();
         rays(&points, v.p)
     };
-    let (Some(l), Some(r)) = (thin(clicked[0], &views[0]), thin(clicked[1], &views[1])) else { return Vec::new() };
+    let (Some(l), Some(r)) = (thin(clicked[0], &views[0]), thin(clicked[1], &views[1])) else { return (Vec::new(), 0) };
     let all: Vec<Ray> = l.into_iter().chain(r).collect();
     let keep = vec![true; all.len()];
     let major = 0.5 * (clicked[0].ellipse.a + clicked[1].ellipse.a);
@@ -145,10 +150,10 @@ fn guesses(
         for w in &widths {
             let Some(t) = between(&knots, *w, 0.5 * w * pixel) else { continue };
             let (worth, likely) = support(views, &t, clicked_outer, 2.0);
-            row.push(Guess { torus: t, clicked_outer, worth, likely, excess: 0.0 });
+            row.push(Guess { torus: t, clicked_outer, worth, likely, usual: 0.0 });
         }
         let usual = median(row.iter().map(|g| g.worth).collect());
-        row.iter_mut().for_each(|g| g.excess = g.worth - usual);
+        row.iter_mut().for_each(|g| g.usual = usual);
         for k in 0..row.len() {
             let w = |k: Option<usize>| k.and_then(|k| row.get(k)).map_or(0.0, |g| g.likely);
             if let Some(g) = row
@@ -161,7 +166,7 @@ fn guesses(
     }
     out.sort_by(|a, b| b.likely.total_cmp(&a.likely));
     out.truncate(GUESSES);
-    out
+    (out, widths.len())
 }
 
 /// The bar of some thickness from its neighbours among the fitted ones.

@@ -1,7 +1,7 @@
 //! From what the operator selected to the contours that may be meant.
 //!
 //! A click near a painted line means one of its two edges, and nobody knows which; the other view decides. So a selection gives a few contours, the
-//! likeliest first, each through edges next to the click, and the pair that is the picture of one rim is taken (see [`crate::offline::pairs::pairing`]).
+//! likeliest first, each through edges next to the click, and the pair that is the picture of one rim is taken (see [`crate::offline::decide::pairing`]).
 
 use crate::offline::contour::quick_fit::Walk;
 use crate::offline::contour::{Contour, LEAST_COVERAGE, Trial, ViewEdges, alike};

@@ -7,7 +7,7 @@ use crate::offline::drawing::canvas::{Canvas, Face, Rgba};
 use crate::offline::edges::lens::Lens;
 use crate::offline::edges::picture::Picture;
 use crate::offline::handle::grasp::object_frame;
-use crate::offline::pairs::propose::Proposal;
+use crate::offline::decide::propose::Proposal;
 use crate::offline::plan::{Plan, model_name};
 use graspd_rt::geom::{Pixel, Pose, Vec3, View};
 use graspd_rt::setpoint::Goal;

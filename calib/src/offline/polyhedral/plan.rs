@@ -241,6 +241,7 @@ impl Survey<'_> {
             selection: None,
             edges: None,
             cones: None,
+            seen_rig: None,
             mesh: Some(placed.record.clone()),
             model: Vec::new(),
             candidate,

@@ -1,10 +1,8 @@
 //! From edge points in two views to a circle or ellipse in space: section 4 of the paper in closed form, then at maximum likelihood.
 //!
 //! [`cone`] is 4.1, [`pencil`] 4.2, [`plane`] 4.3.1 and 4.3.2, [`circle`] 4.3.3; [`planar`] runs them, [`ml`] refines, [`reconstruct`] chooses the model
-//! ([`model`] says what comes out, [`refusal`] why nothing does), `systematic` widens the covariance by what edges have wrong
-//! together, `average` by what a circle may be wrong by that is none.
+//! ([`model`] says what comes out, [`refusal`] why nothing does).
 
-pub(in crate::offline) mod average;
 pub mod circle;
 pub mod cone;
 pub mod ml;
@@ -15,4 +13,3 @@ pub mod plane;
 pub mod reconstruct;
 pub mod refusal;
 pub mod synthetic;
-pub(in crate::offline) mod systematic;

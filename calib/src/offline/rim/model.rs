@@ -202,6 +202,13 @@ pub struct Report {
     pub sigma_centre: f64,
     /// Square root of the trace of the normal's covariance, radians.
     pub sigma_normal: f64,
+    /// The same *in the images*: of the centre relative to a gripper whose marks both cameras see at their predicted places. A loop closed in
+    /// both images ends there, whatever the rig error that moves rim and marks alike. Length units.
+    pub sigma_centre_in_images: f64,
+    /// The same of the normal, radians.
+    pub sigma_normal_in_images: f64,
+    /// Size of the part of the edge error that varies smoothly round the contours, pixels.
+    pub smooth_px: f64,
     /// Semi-minor axes of the rim's pictures, left and right, pixels.
     pub minor_axis_px: [f64; 2],
     /// Angle between the two viewing rays of the centre, radians.

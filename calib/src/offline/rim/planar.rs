@@ -5,7 +5,7 @@
 use crate::offline::conic::robust::{self, RobustFit};
 use crate::offline::conic::sampson::Cloud;
 use crate::offline::conic::{FitError, fit_ml};
-use crate::offline::pairs::correspondence::{excess_limit, gaps_with_sigma};
+use crate::offline::correspondence::tangency::{excess_limit, gaps_with_sigma};
 use crate::offline::rim::circle::{ClosedForm, between_cameras, check_depth, check_front, extract};
 use crate::offline::rim::cone::{ConePair, check_cameras};
 use crate::offline::rim::ml::{MlFit, TwoViews};
@@ -47,14 +47,28 @@ pub struct Analysis {
     pub ellipse: Result<MlFit, Refusal>,
     /// Maximum-likelihood circle.
     pub circle: Result<MlFit, Refusal>,
-    /// Chi-squared of the circle in the plane between the cameras, where the ellipse in the other plane is no circle.
-    pub between: Option<f64>,
+    /// The circle in the plane between the cameras with its chi-squared, where the ellipse in the other plane is no circle.
+    pub between: Option<(Rim, f64)>,
     /// Two-view excess over the one-view fits, in units of the noise variance.
     pub excess: f64,
     /// Its limit at the gate.
     pub excess_limit: f64,
     /// Whether the contours are two pictures of one plane rim seen from its face; otherwise why not.
     pub verdict: Result<(), Refusal>,
+}
+
+impl Analysis {
+    /// Any plane rim there is, the circle first: the outline of a bar is nearly round and a circle is stiffer.
+    pub(crate) fn any_rim(&self) -> Option<Rim> {
+        let fits = [&self.circle, &self.ellipse].into_iter().filter_map(|f| f.as_ref().ok()).map(|f| f.rim);
+        let closed = [&self.polar, &self.paper].into_iter().filter_map(|f| f.as_ref().ok()).map(|f| f.rim);
+        fits.chain(closed).next()
+    }
+
+    /// Why there is no plane rim.
+    pub(crate) fn no_rim(&self) -> Refusal {
+        self.verdict.clone().err().or(self.ellipse.clone().err()).unwrap_or(Refusal::NoFit { why: "no model fits" })
+    }
 }
 
 /// The points of one outline, and where each comes from.
@@ -232,7 +246,7 @@ fn between(
     polar: &Result<ClosedForm, Refusal>,
     cones: &ConePair,
     p: [&Projection; 2],
-) -> Option<f64> {
+) -> Option<(Rim, f64)> {
     if ellipse.as_ref().is_ok_and(|e| e.rim.b > NEARLY_ROUND * e.rim.a) {
         return None;
     }
@@ -241,7 +255,7 @@ fn between(
         return None;
     }
     let r = (start.a * start.b).sqrt();
-    views.fit(&Rim { a: r, b: r, ..start }, RimModel::Circle).ok().map(|f| f.chi2)
+    views.fit(&Rim { a: r, b: r, ..start }, RimModel::Circle).ok().map(|f| (f.rim, f.chi2))
 }
 
 /// The lowest admissible minimum over some starts.

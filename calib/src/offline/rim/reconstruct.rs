@@ -46,22 +46,14 @@ pub fn reconstruct(
     }
 }
 
-/// The bar that fits contours as outer outlines, however well they determine it, and its sum of squares with residuals cut off at the gate of a noise.
-pub(crate) fn bar_alone(
+/// The bar that fits contours as outer outlines, however well they determine it.
+pub(crate) fn bar_start(
     points: [&[EdgePoint]; 2],
     p: [&Projection; 2],
-    noise: f64,
+    analysis: &Analysis,
     options: &Options,
-) -> Option<(Torus, f64)> {
-    let analysis = analyse(points, p, options).ok()?;
-    let bar = fit_bar(points, p, &analysis, options).ok()?;
-    let chi2 = truncated(&scaled(&bar.residuals, points, |_| true), noise);
-    Some((bar.fit.torus, chi2))
-}
-
-/// The same sum for a reconstruction of the same points.
-pub(crate) fn cut_off(r: &Reconstruction, points: [&[EdgePoint]; 2], noise: f64) -> f64 {
-    truncated(&scaled(&r.report.residuals, points, |_| true), noise)
+) -> Option<Torus> {
+    fit_bar(points, p, analysis, options).ok().map(|bar| bar.fit.torus)
 }
 
 /// The plane models alone.
@@ -189,7 +181,7 @@ pub fn choose_plane_model(a: &Analysis, rim: RimChoice, options: &Options) -> Re
     // As good a circle between the cameras with two parameters less, or a better one than the circle before them.
     let margin = if fit.model == RimModel::Ellipse { BETWEEN } else { -BETWEEN };
     let yardstick = noise_of(a.ellipse.as_ref().unwrap_or(fit), a, options);
-    if a.between.is_some_and(|chi2| chi2 < fit.chi2 + margin * yardstick * yardstick) {
+    if a.between.is_some_and(|(_, chi2)| chi2 < fit.chi2 + margin * yardstick * yardstick) {
         return Err(Refusal::OppositeSides {
             why: "the plane between the cameras carries a circle there, the one before them none",
         });
@@ -224,6 +216,13 @@ fn noise_of(fit: &MlFit, a: &Analysis, options: &Options) -> f64 {
         Noise::AtLeastGiven => fit.noise().max(1.0),
         Noise::FromFit => fit.noise().max(1e-12 * a.noise),
     }
+}
+
+/// Holds a decided reconstruction against the task's tolerance *in the images*: the loop closes in both, so that the absolute error that a
+/// rig moves rim and marks by together does not reach the grasp.
+pub(crate) fn tolerable_in_images(r: &Reconstruction, options: &Options) -> Result<(), Refusal> {
+    let (centre, normal) = (r.report.sigma_centre_in_images, r.report.sigma_normal_in_images);
+    tolerable(centre, normal, r.rim.a, r.report.vergence, r.model, options)
 }
 
 /// Refuses a result that is less certain than the task allows, with the advice that fits the cause.
@@ -266,6 +265,9 @@ pub(crate) fn base_report(a: &Analysis, points: [&[EdgePoint]; 2]) -> Report {
     Report {
         sigma_centre: f64::NAN,
         sigma_normal: f64::NAN,
+        sigma_centre_in_images: f64::NAN,
+        sigma_normal_in_images: f64::NAN,
+        smooth_px: f64::NAN,
         minor_axis_px: [a.fits[0].fit.ellipse.b, a.fits[1].fit.ellipse.b],
         vergence: f64::NAN,
         rank2,

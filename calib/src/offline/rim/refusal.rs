@@ -10,6 +10,16 @@ pub(crate) fn name(view: &View) -> &'static str {
     }
 }
 
+/// What to do about two contours that do not belong together, by what explains it best.
+fn different_advice(gap_px: &[f64; 2], rig_px: f64) -> &'static str {
+    let gap = gap_px.iter().filter(|g| g.is_finite()).map(|g| g.abs()).fold(0.0, f64::max);
+    if gap < 3.0 * rig_px {
+        "either another contour was clicked in one image, or the calibration is off: click the same contour in both images, and check the rig file (calibrate again) if the refusal stays"
+    } else {
+        "click the same contour in both images"
+    }
+}
+
 /// Why no rim is returned. The text says what was found and what to change.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -96,6 +106,20 @@ pub enum Refusal {
         /// The paper's condition, scale-free.
         delta: f64,
     },
+    /// The likelihood of two contours speaks for two different things.
+    #[error("the two contours are not one rim: with probability {probability:.2} they are two different contours (epipolar tangents differ by {:.2} and {:.2} px; the rig's unknown error explains {rig_px:.2} px): {}",
+        gap_px[0], gap_px[1], different_advice(gap_px, *rig_px))]
+    Different {
+        /// Epipolar tangency gaps, pixels.
+        gap_px: [f64; 2],
+        /// Probability that the contours are unrelated.
+        probability: f64,
+        /// Epipolar displacement that the rig may have wrong, one standard deviation, pixels.
+        rig_px: f64,
+    },
+    /// The operator named a round bar, and the outlines are not those of one.
+    #[error("the contours are not the outlines of a round bar: no bar explains them as well as a plane rim does: click an outline of the bar, or leave the kind of rim open (--rim auto)")]
+    NotABar,
     /// What is seen of the contours is too little to tell whether they belong together.
     #[error(
         "too little is seen of one contour to hold it against the other: its epipolar tangents are known to {gap_sigma_px:.2} px only (limit {limit_px:.2}): click more of the rim, or a rim that is less hidden"

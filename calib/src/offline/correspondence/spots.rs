@@ -4,6 +4,8 @@
 //! the pictures can. Distinct spots of one picture are looked for in the other along the lines, and in front of both cameras, where the rig says that they
 //! have to be; in the right order they are found, in the wrong one their lines run elsewhere, or their places lie behind the cameras.
 
+use crate::offline::correspondence::refine;
+use crate::offline::correspondence::rig_error::Match;
 use crate::offline::edges::lens::Lens;
 use crate::offline::edges::picture::Picture;
 use crate::offline::rim::cone::camera_centre;
@@ -12,7 +14,7 @@ use graspd_rt::geom::Pixel;
 use nalgebra::Vector3;
 
 /// Cells of the left picture that give one spot each, across and down.
-const CELLS: [usize; 2] = [12, 10];
+const CELLS: [usize; 2] = [20, 16];
 /// Half the side of a patch, pixels of the halved picture.
 const HALF: i32 = 6;
 /// A spot is found where the correlation is at least this.
@@ -226,31 +228,82 @@ impl Totals {
     }
 }
 
-/// Lets the spots of the first picture vote on the order of both. `noise` is the pictures' noise in grey levels.
-pub fn votes(pictures: [&Picture; 2], lenses: [&Lens; 2], p: [&Projection; 2], noise: f64) -> Votes {
-    let mut votes = Votes::default();
-    let small = pictures.map(Small::of);
-    let (Some(a), Some(b)) = (Ray::new(lenses, p, 0), Ray::new(lenses, p, 1)) else { return votes };
+/// What the spots of two images say: their votes on the order, and where those that were found in the order as given lie.
+#[derive(Clone, Debug, Default)]
+pub struct Spots {
+    /// Votes on the order of the images.
+    pub votes: Votes,
+    /// Places of one point in both images.
+    pub matches: Vec<Match>,
+}
+
+/// Looks for the spots of the first image in the second, in both orders. `noise` is the images' noise in grey levels.
+pub fn spots(images: [&Picture; 2], lenses: [&Lens; 2], p: [&Projection; 2], noise: f64) -> Spots {
+    let mut out = Spots::default();
+    let small = images.map(Small::of);
+    let (Some(a), Some(b)) = (Ray::new(lenses, p, 0), Ray::new(lenses, p, 1)) else { return out };
     let least = (1.5 * noise).max(1.0) as f32;
     let totals = Totals::of_picture(&small[1]);
     for (x, y) in small[0].spots() {
         let Some(wanted) = small[0].patch(x as i32, y as i32, least) else { continue };
         let at = Pixel::new(2.0 * x as f64 + 0.5, 2.0 * y as f64 + 0.5);
-        // The first picture is the left camera's as given, the right camera's if exchanged.
-        let mut best = [-1.0f32; 2];
-        for (ray, best) in [&a, &b].into_iter().zip(&mut best) {
-            for (u, v) in ray.places(at) {
-                if let Some(c) = small[1].correlation(&wanted, &totals, u, v, 0.5 * least) {
-                    *best = best.max(c);
-                }
+        // The first image is the left camera's as given, the right camera's if exchanged.
+        let look = |ray: &Ray<'_>| {
+            let correlation = |u: i32, v: i32| small[1].correlation(&wanted, &totals, u, v, 0.5 * least);
+            search(&ray.places(at), correlation)
+        };
+        let [given, other] = [look(&a), look(&b)];
+        let size = [given, other].map(|f| f.map_or(-1.0, |f| f64::from(f.0)));
+        if size[0].max(size[1]) >= FOUND && (size[0] - size[1]).abs() >= BETTER {
+            *(if size[0] > size[1] { &mut out.votes.as_given } else { &mut out.votes.exchanged }) += 1;
+        }
+        let Some((_, u, v)) = given.filter(|_| size[0] >= FOUND) else { continue };
+        let start = Pixel::new(2.0 * f64::from(u) + 0.5, 2.0 * f64::from(v) + 0.5);
+        out.matches.extend(refine::refine(images, at, start, noise).and_then(|found| {
+            let ideal = [lenses[0].ideal(at)?, lenses[1].ideal(found.at)?];
+            let line = a.normal_at(ideal[0])?;
+            Some(Match { at: ideal, sigma: found.sigma_along(line) })
+        }));
+    }
+    out
+}
+
+/// Places along the line from which the search climbs.
+const CLIMBS: usize = 3;
+/// Steps of a climb at most: the rig's error moves a place off its line by a few pixels of the halved image.
+const CLIMB_STEPS: usize = 5;
+
+/// The best correlation near a line: from its highest places uphill, because the line is only as good as the rig.
+fn search(places: &[(i32, i32)], correlation: impl Fn(i32, i32) -> Option<f32>) -> Option<(f32, i32, i32)> {
+    let along: Vec<f32> = places.iter().map(|(u, v)| correlation(*u, *v).unwrap_or(-1.0)).collect();
+    let value = |k: Option<usize>| k.and_then(|k| along.get(k)).copied().unwrap_or(-1.0);
+    let mut peaks: Vec<(f32, (i32, i32))> = along
+        .iter()
+        .zip(places)
+        .enumerate()
+        .filter(|(k, (c, _))| **c > -1.0 && **c >= value(k.checked_sub(1)) && **c > value(Some(k + 1)))
+        .map(|(_, (c, p))| (*c, *p))
+        .collect();
+    peaks.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let mut best: Option<(f32, i32, i32)> = None;
+    for (c, (u, v)) in peaks.into_iter().take(CLIMBS) {
+        let mut at = (c, u, v);
+        for _ in 0..CLIMB_STEPS {
+            let round = [(-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)];
+            let next = round
+                .iter()
+                .filter_map(|(i, j)| correlation(at.1 + i, at.2 + j).map(|c| (c, at.1 + i, at.2 + j)))
+                .max_by(|a, b| a.0.total_cmp(&b.0));
+            match next.filter(|n| n.0 > at.0) {
+                Some(n) => at = n,
+                None => break,
             }
         }
-        let [given, other] = best.map(f64::from);
-        if given.max(other) >= FOUND && (given - other).abs() >= BETTER {
-            *(if given > other { &mut votes.as_given } else { &mut votes.exchanged }) += 1;
+        if best.is_none_or(|b| at.0 > b.0) {
+            best = Some(at);
         }
     }
-    votes
+    best
 }
 
 /// From a pixel of one camera's picture to its line in the other's.
@@ -273,6 +326,14 @@ impl<'a> Ray<'a> {
             back: m.try_inverse()?,
             baseline: (eyes[0] - eyes[1]).norm(),
         })
+    }
+
+    /// Unit normal of an ideal pixel's line in the other image.
+    fn normal_at(&self, ideal: Pixel) -> Option<Pixel> {
+        let h = self.to * self.eye.push(1.0);
+        let d = self.to * (self.back * Vector3::new(ideal.x, ideal.y, 1.0)).push(0.0);
+        let l = h.cross(&d);
+        Pixel::new(l.x, l.y).try_normalize(1e-12)
     }
 
     /// Half-size pixels of the other picture, one after the other, from near to infinitely far.

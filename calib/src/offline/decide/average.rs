@@ -5,16 +5,8 @@
 //! covariance becomes that of both models together, each by its probability.
 
 use crate::offline::rim::circle::frame_of;
-use crate::offline::rim::model::{Reconstruction, RimModel, Score};
+use crate::offline::rim::model::Reconstruction;
 use nalgebra::{Matrix2, Vector2};
-
-/// Probability of the ellipse where a circle was chosen, from the information criterion (both equally likely beforehand). `None` where they were not compared,
-/// or the ellipse was the better one by the edges alone.
-pub(in crate::offline) fn share_of_ellipse(scores: &[Score]) -> Option<f64> {
-    let bic = |m| scores.iter().find(|s| s.model == m && s.excluded.is_none()).map(|s| s.bic);
-    let behind = bic(RimModel::Ellipse)? - bic(RimModel::Circle)?;
-    (behind >= 0.0).then(|| 1.0 / (1.0 + (0.5 * behind).exp()))
-}
 
 /// Widens a reconstruction's covariance by that of another model of the same edges, which has this probability.
 pub(in crate::offline) fn average(r: &mut Reconstruction, other: &Reconstruction, share: f64) {
@@ -31,6 +23,10 @@ pub(in crate::offline) fn average(r: &mut Reconstruction, other: &Reconstruction
     let cov = other.cov_centre_normal * turn.transpose();
     r.cov_centre_normal = r.cov_centre_normal * own + (cov + centre * normal.transpose()) * share;
     r.cov_axes = r.cov_axes * own + (other.cov_axes + axes * axes.transpose()) * share;
+    let grown = |own: f64, of: f64, by: f64| ((1.0 - share) * own * own + share * (of * of + by * by)).sqrt();
+    let (mine, theirs) = (&mut r.report, &other.report);
+    mine.sigma_centre_in_images = grown(mine.sigma_centre_in_images, theirs.sigma_centre_in_images, centre.norm());
+    mine.sigma_normal_in_images = grown(mine.sigma_normal_in_images, theirs.sigma_normal_in_images, normal.norm());
     r.report.sigma_centre = r.cov_centre.trace().sqrt();
     r.report.sigma_normal = r.cov_normal.trace().sqrt();
 }
@@ -100,15 +96,5 @@ mod tests {
                 close(both.cov_normal[(i, j)], sum[(3 + i, 3 + j)], (sum[(3 + i, 3 + i)] * sum[(3 + j, 3 + j)]).sqrt());
             }
         }
-    }
-
-    #[test]
-    fn the_share_is_a_probability_and_missing_where_the_ellipse_won() {
-        let score = |model, bic| Score { model, chi2: 1.0, parameters: 6, bic, excluded: None };
-        let share = |e| share_of_ellipse(&[score(RimModel::Circle, 100.0), score(RimModel::Ellipse, e)]);
-        assert_eq!(share(100.0), Some(0.5));
-        assert!(share(110.0).is_some_and(|s| (s - 0.0067).abs() < 1e-4));
-        assert_eq!(share(99.0), None);
-        assert_eq!(share_of_ellipse(&[score(RimModel::Circle, 100.0)]), None);
     }
 }
