@@ -1,0 +1,278 @@
+//! What nobody can do better: the maximum-likelihood rim on exact edge points with the rig as given, and where a perfect loop ends.
+//!
+//! Written apart from the off-line stage that is judged: numeric derivatives, no gates, no shared code but the camera model.
+
+use graspd_rt::geom::{Pixel, Pose, Rig, Vec3, View, exp_twist};
+use graspd_rt::gripper::Gripper;
+use graspd_rt::setpoint::Goal;
+use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Point3, Rotation3, UnitQuaternion, Vector2};
+use std::f64::consts::TAU;
+
+/// Edge points of a view on a whole rim.
+pub const POINTS: usize = 150;
+/// Steps of the fits; they end earlier when they stand still.
+const STEPS: usize = 40;
+
+/// A rim in space: a plane circle or ellipse, or a round bar bent to a circle.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Shape {
+    /// Centre, metres; of the core circle for a bar.
+    pub centre: Vec3,
+    /// Unit normal, towards the cameras.
+    pub normal: Vec3,
+    /// Unit direction of the semi-axis `a`.
+    pub axis_a: Vec3,
+    /// Semi-axes, metres; equal for a circle and for a bar's core.
+    pub axes: [f64; 2],
+    /// Radius of the bar, metres; `None` for a plane edge.
+    pub bar: Option<f64>,
+}
+
+impl Shape {
+    /// A plane circle, or the core circle of a bar.
+    pub fn circle(centre: Vec3, normal: Vec3, radius: f64, bar: Option<f64>) -> Self {
+        Self { centre, normal, axis_a: frame(&normal)[0], axes: [radius; 2], bar }
+    }
+
+    /// Frame at the centre, z along the normal.
+    pub fn pose(&self) -> Pose {
+        let y = self.normal.cross(&self.axis_a);
+        let m = Matrix3::from_columns(&[self.axis_a, y, self.normal]);
+        let r = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(m));
+        Pose::from_parts(self.centre.into(), r)
+    }
+
+    /// Point of a plane rim, or of a bar's core, at an angle from `axis_a`.
+    pub fn point(&self, angle: f64) -> Vec3 {
+        let y = self.normal.cross(&self.axis_a);
+        self.centre + self.axis_a * (self.axes[0] * angle.cos()) + y * (self.axes[1] * angle.sin())
+    }
+
+    /// Points of a bar's outer and inner outline at a core angle as seen from a place; `None` where the eye is inside the bar's reach.
+    ///
+    /// On the tube around core direction `e` the surface normal `m = e cos v + n sin v` is perpendicular to the sight line:
+    /// `m . d = -r`, with `d` from the eye to the core point.
+    pub fn outlines(&self, eye: &Vec3, angle: f64) -> Option<[Vec3; 2]> {
+        let bar = self.bar?;
+        let core = self.point(angle);
+        let e = (core - self.centre).normalize();
+        let d = core - eye;
+        let (x, y) = (e.dot(&d), self.normal.dot(&d));
+        let half = (-bar / x.hypot(y)).clamp(-1.0, 1.0).acos();
+        let mut v = [y.atan2(x) + half, y.atan2(x) - half];
+        if v[1].cos() > v[0].cos() {
+            v.swap(0, 1);
+        }
+        Some(v.map(|v| core + (e * v.cos() + self.normal * v.sin()) * bar))
+    }
+
+    /// How many numbers describe it: the circle's 6, the ellipse's 8, the bar's 7.
+    fn parameters(&self) -> usize {
+        match self.bar {
+            Some(_) => 7,
+            None if self.axes[0] == self.axes[1] => 6,
+            None => 8,
+        }
+    }
+
+    /// The ray's signed distance from the rim, metres: across the plane's curve, or from the bar's surface.
+    fn distance(&self, s: &Matrix2<f64>, ray: &Ray) -> f64 {
+        let y = self.normal.cross(&self.axis_a);
+        if let Some(bar) = self.bar {
+            return self.from_core(ray, &y) - bar;
+        }
+        let t = (self.centre - ray.eye).dot(&self.normal) / ray.way.dot(&self.normal);
+        let p = ray.eye + ray.way * t - self.centre;
+        let in_plane = Vector2::new(p.dot(&self.axis_a), p.dot(&y));
+        s.try_inverse().map_or(f64::NAN, |i| ((i * in_plane).norm() - 1.0) * self.axes[0])
+    }
+
+    /// Distance of a ray from the bar's core circle, by Newton's steps on the angle.
+    fn from_core(&self, ray: &Ray, y: &Vec3) -> f64 {
+        let radius = self.axes[0];
+        let across = |v: Vec3| v - ray.way * ray.way.dot(&v);
+        let t = (self.centre - ray.eye).dot(&self.normal) / ray.way.dot(&self.normal);
+        let p = ray.eye + ray.way * t - self.centre;
+        let mut angle = p.dot(y).atan2(p.dot(&self.axis_a));
+        let (c, u, v) = (across(self.centre - ray.eye), across(self.axis_a * radius), across(y * radius));
+        for _ in 0..20 {
+            let (sin, cos) = angle.sin_cos();
+            let at = c + u * cos + v * sin;
+            let (first, second) = (v * cos - u * sin, -(u * cos + v * sin));
+            let (slope, bend) = (at.dot(&first), first.dot(&first) + at.dot(&second));
+            let step = if bend > 0.0 { -slope / bend } else { -0.1 * slope.signum() }.clamp(-0.3, 0.3);
+            angle += step;
+            if step.abs() < 1e-12 {
+                break;
+            }
+        }
+        (c + u * angle.cos() + v * angle.sin()).norm()
+    }
+}
+
+/// Two unit vectors across a normal.
+fn frame(n: &Vec3) -> [Vec3; 2] {
+    let x = if n.x.abs() < 0.9 { Vec3::x() } else { Vec3::y() };
+    let x = (x - n * n.dot(&x)).normalize();
+    [x, n.cross(&x)]
+}
+
+/// A viewing ray in the left camera's frame.
+#[derive(Clone, Copy)]
+struct Ray {
+    eye: Vec3,
+    way: Vec3,
+}
+
+fn ray(rig: &Rig, view: View, pixel: Pixel) -> Option<Ray> {
+    let to_left = rig.view_from_left(view).inverse();
+    Some(Ray { eye: rig.centre(view), way: to_left.rotation * rig.camera(view).ray(pixel)? })
+}
+
+/// A pixel's ray and those half a pixel to its four sides, which give the change of a distance by the pixel.
+struct Seen {
+    at: Ray,
+    around: [Ray; 4],
+}
+
+/// The shape moved by parameters: centre, tilt, then radius, or symmetric shape matrix, or core and bar.
+fn moved(start: &Shape, x: &DVector<f64>) -> (Shape, Matrix2<f64>) {
+    let y = start.normal.cross(&start.axis_a);
+    let unit = start.axes[0];
+    let mut out = *start;
+    out.centre += Vec3::new(x[0], x[1], x[2]) * unit;
+    out.normal = (start.normal + start.axis_a * x[3] + y * x[4]).normalize();
+    out.axis_a = (start.axis_a - out.normal * out.normal.dot(&start.axis_a)).normalize();
+    let mut s = Matrix2::new(start.axes[0], 0.0, 0.0, start.axes[1]);
+    match x.len() {
+        8 => s += Matrix2::new(x[5], x[6], x[6], x[7]) * unit,
+        n => {
+            s *= 1.0 + x[5];
+            out.axes = start.axes.map(|a| a * (1.0 + x[5]));
+            if n == 7 {
+                out.bar = start.bar.map(|b| b * (1.0 + x[6]));
+            }
+        }
+    }
+    (out, s)
+}
+
+/// Minimises a sum of squares by damped Gauss-Newton steps with numeric derivatives.
+fn minimise(n: usize, residuals: impl Fn(&DVector<f64>) -> Option<DVector<f64>>) -> Option<DVector<f64>> {
+    const H: f64 = 1e-6;
+    let mut x = DVector::zeros(n);
+    let mut r = residuals(&x)?;
+    let mut damping = 1e-6;
+    for _ in 0..STEPS {
+        let mut j = DMatrix::zeros(r.len(), n);
+        for k in 0..n {
+            let mut ahead = x.clone();
+            ahead[k] += H;
+            let mut behind = x.clone();
+            behind[k] -= H;
+            j.set_column(k, &((residuals(&ahead)? - residuals(&behind)?) / (2.0 * H)));
+        }
+        let (normal, gradient) = (j.transpose() * &j, j.transpose() * &r);
+        let mut length = f64::INFINITY;
+        for _ in 0..12 {
+            let mut m = normal.clone();
+            for k in 0..n {
+                m[(k, k)] *= 1.0 + damping;
+            }
+            let step = -m.cholesky()?.solve(&gradient);
+            let tried = &x + &step;
+            match residuals(&tried).filter(|t| t.norm_squared() <= r.norm_squared()) {
+                Some(t) => {
+                    (x, r, length) = (tried, t, step.norm());
+                    damping = (damping * 0.1).max(1e-12);
+                    break;
+                }
+                None => damping = (damping * 10.0).max(1e-9),
+            }
+        }
+        if !(1e-10..f64::INFINITY).contains(&length) {
+            break;
+        }
+    }
+    Some(x)
+}
+
+/// The rim that fits raw edge pixels best when a rig is believed, starting from the truth: distances in pixels, every point alike.
+pub fn best_fit(start: &Shape, pixels: &[Vec<Pixel>; 2], rig: &Rig) -> Option<Shape> {
+    let mut seen = Vec::new();
+    for view in View::BOTH {
+        for p in &pixels[view.index()] {
+            let side = [(0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)].map(|(u, v)| p + Pixel::new(u, v));
+            let [Some(a), Some(b), Some(c), Some(d)] = side.map(|p| ray(rig, view, p)) else { return None };
+            seen.push(Seen { at: ray(rig, view, *p)?, around: [a, b, c, d] });
+        }
+    }
+    let mut shape = *start;
+    // The change of a distance by the pixel belongs to a shape: fitted, renewed, fitted again.
+    for _ in 0..4 {
+        let s = Matrix2::new(shape.axes[0], 0.0, 0.0, shape.axes[1]);
+        let weight: Vec<f64> = seen
+            .iter()
+            .map(|q| {
+                let d = q.around.map(|r| shape.distance(&s, &r));
+                1.0 / (d[0] - d[1]).hypot(d[2] - d[3])
+            })
+            .collect();
+        let n = start.parameters();
+        let x = minimise(n, |x| {
+            let (moved, s) = moved(&shape, x);
+            let r = DVector::from_iterator(
+                seen.len(),
+                seen.iter().zip(&weight).map(|(q, w)| moved.distance(&s, &q.at) * w),
+            );
+            r.iter().all(|v| v.is_finite()).then_some(r)
+        })?;
+        let (next, s) = moved(&shape, &x);
+        shape = if n == 8 { with_shape(next, &s) } else { next };
+    }
+    Some(shape)
+}
+
+/// Axes and their direction from the symmetric shape matrix.
+fn with_shape(mut shape: Shape, s: &Matrix2<f64>) -> Shape {
+    let e = s.symmetric_eigen();
+    let major = e.eigenvalues.imax();
+    let (a, v) = (e.eigenvalues[major], e.eigenvectors.column(major));
+    let y = shape.normal.cross(&shape.axis_a);
+    shape.axis_a = (shape.axis_a * v[0] + y * v[1]).normalize();
+    shape.axes = [a, e.eigenvalues[1 - major]];
+    shape
+}
+
+/// Where the gripper stands when a loop with the true cameras has brought the marks onto a goal's predicted pixels as well as they go:
+/// least squares over both images.
+pub fn loop_ends(goal: &Goal, gripper: &Gripper, true_rig: &Rig) -> Option<Pose> {
+    let wanted: Vec<(View, Vec3, Pixel)> = View::BOTH
+        .into_iter()
+        .flat_map(|v| {
+            let marks = gripper.marks.iter().zip(goal.marks[v.index()]);
+            marks.filter_map(move |(m, p)| p.map(|p| (v, m.position, p))).collect::<Vec<_>>()
+        })
+        .collect();
+    let pose = |x: &DVector<f64>| {
+        // Rotations in radians, translations in decimetres: about the same effect on the pixels.
+        let v = Vec3::new(x[0], x[1], x[2]) * 0.1;
+        let twist = [v.x, v.y, v.z, x[3], x[4], x[5]];
+        goal.left_from_gripper * exp_twist(&twist.into())
+    };
+    let x = minimise(6, |x| {
+        let pose = pose(x);
+        let mut r = Vec::with_capacity(2 * wanted.len());
+        for (view, mark, pixel) in &wanted {
+            let d = true_rig.project(*view, &(pose * Point3::from(*mark)).coords)? - pixel;
+            r.extend([d.x, d.y]);
+        }
+        Some(DVector::from_vec(r))
+    })?;
+    Some(pose(&x))
+}
+
+/// Angles of `n` places around a rim.
+pub fn around(n: usize) -> impl Iterator<Item = f64> {
+    (0..n).map(move |k| TAU * k as f64 / n as f64)
+}
