@@ -73,7 +73,7 @@ impl ViewEdges<'_> {
         self.settled(seed, best.found, keep)
     }
 
-    /// The best trial ellipse through a seed edge of those that promise most at a glance, at least edges on a part of their outline, `least`.
+    /// The best trial ellipse through a seed edge of those that promise most at a glance; all carry edges on a part of their outline from the start, `least`.
     ///
     /// Nobody pointed at the seed: there are many, most of them on nothing, and judging all that each could be joined to would take seconds.
     pub(in crate::offline) fn promising(&self, seed: usize, least: f64) -> Option<Trial> {
@@ -93,7 +93,8 @@ impl ViewEdges<'_> {
             if *at_most <= best.bar() {
                 break;
             }
-            best.offer(self.judge(e, *bright_inside, 3.0, best.bar()));
+            let floor = least * least * Walk::new(e).perimeter().sqrt();
+            best.offer(self.judge(e, *bright_inside, 3.0, best.bar().max(floor)));
         }
         self.settled(seed, best.found, 1).into_iter().next()
     }

@@ -28,7 +28,7 @@ impl Proposal {
 const SEEDS: usize = 120;
 /// Part of an ellipse that has to carry edges.
 const COVERED: f64 = 0.5;
-/// Part that may carry edges at a glance before a trial ellipse is judged at all: less than it has to have in the end, as settling gathers more.
+/// Part that has to carry edges before a trial ellipse is settled on the edges that it gathers: less than in the end, as settling gathers more.
 const PROMISING: f64 = 0.4;
 /// Ellipses kept of a view.
 const KEPT: usize = 40;
