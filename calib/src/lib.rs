@@ -7,3 +7,4 @@ pub mod mesh_cli;
 pub mod montecarlo;
 pub mod offline;
 pub mod plan_cli;
+mod progress;

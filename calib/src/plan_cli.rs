@@ -7,8 +7,9 @@ use crate::offline::drawing::report;
 use crate::offline::edges::picture::Picture;
 use crate::offline::handle::grasp::Approach;
 use crate::offline::decide::propose::Proposal;
-use crate::offline::plan::{Plan, PlanError, PlanOptions, model_name, plan, plan_proposal, proposals};
+use crate::offline::plan::{Plan, PlanError, PlanOptions, Prepared, model_name};
 use crate::offline::rim::model::RimChoice;
+use crate::progress::Progress;
 use graspd_rt::geom::{Pixel, Pose};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -193,10 +194,14 @@ fn work(r: &Request) -> Result<Outcome, Failure> {
             format!("{} and {} are the same picture: give one of each camera", r.left.display(), r.right.display()),
         ));
     }
+    let views = Prepared::new(pictures, &rig).map_err(|e| failed(&e))?;
     let done = match (left, right) {
-        (Some(l), Some(s)) if !r.auto => plan(pictures, [&l, &s], &rig, &gripper, &options).map_err(|e| failed(&e))?,
+        (Some(l), Some(s)) if !r.auto => views.plan([&l, &s], &gripper, &options).map_err(|e| failed(&e))?,
         _ => {
-            let found = proposals(pictures, &rig, &options, MOST_PROPOSALS).map_err(|e| failed(&e))?;
+            let mut progress = Progress::new("looking for rims");
+            let found = views.proposals(&options, MOST_PROPOSALS, &mut |part| progress.at(part));
+            drop(progress);
+            let found = found.map_err(|e| failed(&e))?;
             if found.is_empty() {
                 return Err((
                     Class::Refused,
@@ -213,7 +218,7 @@ fn work(r: &Request) -> Result<Outcome, Failure> {
             let Some(chosen) = found.get(pick - 1) else {
                 return Err(usage(format!("--pick {pick}: there are {} proposals", found.len())));
             };
-            plan_proposal(pictures, chosen, &rig, &gripper, &options).map_err(|e| failed(&e))?
+            views.plan_proposal(chosen, &gripper, &options).map_err(|e| failed(&e))?
         }
     };
     if let Some(path) = &r.out {

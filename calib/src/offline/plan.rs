@@ -227,6 +227,32 @@ impl<'a> Prepared<'a> {
         })
     }
 
+    /// Ellipses proposed without a selection, ranked, at most `most`. `watch` is told what part of the work is done.
+    pub fn proposals(
+        &self,
+        options: &PlanOptions,
+        most: usize,
+        watch: &mut dyn FnMut(f64),
+    ) -> Result<Vec<Proposal>, PlanError> {
+        self.in_order()?;
+        Ok(propose(&self.edges, [&self.seen.p[0], &self.seen.p[1]], &options.rim, most, watch))
+    }
+
+    /// Plans a grasp on a proposal.
+    pub fn plan_proposal(
+        &self,
+        proposal: &Proposal,
+        gripper: &GripperFile,
+        options: &PlanOptions,
+    ) -> Result<Plan, PlanError> {
+        let [left, right] = proposal.candidates();
+        let record = [0, 1].map(|k| SelectionRecord {
+            kind: "auto".to_owned(),
+            points_px: proposal.contours[k].points.first().map(|p| [p.raw.x, p.raw.y]).into_iter().collect(),
+        });
+        from_candidates(self, [&left, &right], record, gripper, options)
+    }
+
     /// Why the contours do not fit as given, where pictures too plain to tell their order do fit with selections and cameras exchanged.
     fn crossed(&self, selections: [&Selection; 2], options: &PlanOptions) -> Option<Refusal> {
         if self.order().are_as_given() {
@@ -248,35 +274,6 @@ pub fn plan(
     options: &PlanOptions,
 ) -> Result<Plan, PlanError> {
     Prepared::with_prior(pictures, rig, &options.rig)?.plan(selections, gripper, options)
-}
-
-/// Ellipses proposed without a selection, ranked, at most `most`.
-pub fn proposals(
-    pictures: [&Picture; 2],
-    rig: &RigFile,
-    options: &PlanOptions,
-    most: usize,
-) -> Result<Vec<Proposal>, PlanError> {
-    let views = Prepared::with_prior(pictures, rig, &options.rig)?;
-    views.in_order()?;
-    Ok(propose(&views.edges, [&views.seen.p[0], &views.seen.p[1]], &options.rim, most))
-}
-
-/// Plans a grasp on a proposal.
-pub fn plan_proposal(
-    pictures: [&Picture; 2],
-    proposal: &Proposal,
-    rig: &RigFile,
-    gripper: &GripperFile,
-    options: &PlanOptions,
-) -> Result<Plan, PlanError> {
-    let views = Prepared::with_prior(pictures, rig, &options.rig)?;
-    let [left, right] = proposal.candidates();
-    let record = [0, 1].map(|k| SelectionRecord {
-        kind: "auto".to_owned(),
-        points_px: proposal.contours[k].points.first().map(|p| [p.raw.x, p.raw.y]).into_iter().collect(),
-    });
-    from_candidates(&views, [&left, &right], record, gripper, options)
 }
 
 /// The rest of the stage, from each view's candidate contours.

@@ -1,5 +1,6 @@
 //! Trial ellipses through a seed edge, and how well the edges of the picture support them.
 
+use crate::offline::contour::directions::{ALONG, REACH};
 use crate::offline::contour::quick_fit::{Sums, Walk};
 use crate::offline::contour::{LEAST_COVERAGE, ViewEdges, alike};
 use crate::offline::edges::arcs::IdealEdge;
@@ -7,6 +8,15 @@ use crate::offline::rim::model::Ellipse2;
 
 /// Places at which a trial ellipse is judged at most.
 pub(super) const MOST_PLACES: usize = 160;
+
+/// Places of a glance at a trial ellipse, in quarters.
+const GLANCES: usize = 8;
+/// By how much a glance may put the part of an ellipse that carries edges too low: one standard deviation of its 32 places is 0.09, and it takes any edge
+/// in reach for one that fits.
+const MISJUDGED: f64 = 0.05;
+/// Trials of a seed that are judged after a glance at all of them: with 200 the proposals are those of judging all, with 24 the street scene's best one
+/// is missed in one view.
+const JUDGED: usize = 200;
 
 /// A trial ellipse and how well it is supported.
 #[derive(Clone, Debug)]
@@ -43,13 +53,58 @@ impl Best {
     }
 }
 
+/// The ellipse of some sums and whether its inside is the brighter side, if it passes the seed in the seed's direction.
+fn passing(sums: &Sums, s: &IdealEdge) -> Option<(Ellipse2, bool)> {
+    let e = sums.ellipse()?;
+    let (d, n, _) = Walk::new(&e).measure(s.at);
+    let along = s.towards_bright.dot(&n);
+    (d.abs() <= 2.5 && along.abs() >= 0.9).then_some((e, along < 0.0))
+}
+
 impl ViewEdges<'_> {
     /// Trial ellipses through a seed edge, best first, at most `keep` and no two alike.
     pub(in crate::offline) fn trials(&self, seed: usize, keep: usize) -> Vec<Trial> {
-        let (Some(s), Some(own)) = (self.arcs.ideal.get(seed), self.arcs.of(seed)) else { return Vec::new() };
-        let Some(arc) = self.arcs.arcs.get(own) else { return Vec::new() };
+        let mut best = Best { found: Vec::new(), most: 4 * keep };
+        self.joined(seed, |s, sums| {
+            if let Some((e, bright_inside)) = passing(sums, s) {
+                best.offer(self.judge(&e, bright_inside, 3.0, best.bar()));
+            }
+        });
+        self.settled(seed, best.found, keep)
+    }
+
+    /// The best trial ellipse through a seed edge of those that promise most at a glance; all carry edges on a part of their outline from the start, `least`.
+    ///
+    /// Nobody pointed at the seed: there are many, most of them on nothing, and judging all that each could be joined to would take seconds.
+    pub(in crate::offline) fn promising(&self, seed: usize, least: f64) -> Option<Trial> {
+        let mut glanced: Vec<(f64, Ellipse2, bool)> = Vec::new();
+        self.joined(seed, |s, sums| {
+            if let Some((e, bright_inside)) = passing(sums, s) {
+                let part = self.glance(&e, bright_inside);
+                if part >= least {
+                    let at_most = part + MISJUDGED;
+                    glanced.push((at_most * at_most * Walk::new(&e).perimeter().sqrt(), e, bright_inside));
+                }
+            }
+        });
+        glanced.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let mut best = Best { found: Vec::new(), most: 4 };
+        for (at_most, e, bright_inside) in glanced.iter().take(JUDGED) {
+            if *at_most <= best.bar() {
+                break;
+            }
+            let floor = least * least * Walk::new(e).perimeter().sqrt();
+            best.offer(self.judge(e, *bright_inside, 3.0, best.bar().max(floor)));
+        }
+        self.settled(seed, best.found, 1).into_iter().next()
+    }
+
+    /// Gives a function the sums of a seed's neighbourhood, alone and with every arc that could join it, and the seed.
+    fn joined(&self, seed: usize, mut take: impl FnMut(&IdealEdge, &Sums)) {
+        let (Some(s), Some(own)) = (self.arcs.ideal.get(seed), self.arcs.of(seed)) else { return };
+        let Some(arc) = self.arcs.arcs.get(own) else { return };
         if !s.at.x.is_finite() {
-            return Vec::new();
+            return;
         }
         let place = arc.edges.iter().position(|k| *k as usize == seed).unwrap_or(0);
         let blank = Sums::new(s.at, 100.0);
@@ -64,9 +119,8 @@ impl ViewEdges<'_> {
             }
             sums
         };
-        let mut best = Best { found: Vec::new(), most: 4 * keep };
         for half in [25, 50, 100, 200, 5000] {
-            best.offer(self.trial(&piece(half), &s, best.bar()));
+            take(&s, &piece(half));
             if half > arc.edges.len() {
                 break;
             }
@@ -84,10 +138,15 @@ impl ViewEdges<'_> {
             for e in samples.iter().filter_map(|k| self.arcs.ideal.get(*k as usize)) {
                 sums.add(e.at, 1.0);
             }
-            best.offer(self.trial(&near.plus(&sums), &s, best.bar()));
+            take(&s, &near.plus(&sums));
         }
+    }
+
+    /// The best trials of a seed settled, best first, at most `keep` and no two alike.
+    fn settled(&self, seed: usize, best: Vec<Trial>, keep: usize) -> Vec<Trial> {
+        let Some(s) = self.arcs.ideal.get(seed) else { return Vec::new() };
         let mut out: Vec<Trial> = Vec::new();
-        for t in best.found {
+        for t in best {
             let t = self.settle(t, &s);
             if t.coverage >= 0.8 * LEAST_COVERAGE && !out.iter().any(|o| alike(&o.ellipse, &t.ellipse)) {
                 out.push(t);
@@ -120,59 +179,81 @@ impl ViewEdges<'_> {
         inside == 3 || outside == 3
     }
 
-    /// The ellipse of some sums as a trial, if it passes the seed in the seed's direction. `bar` as in [`Self::judge`].
-    fn trial(&self, sums: &Sums, s: &IdealEdge, bar: f64) -> Option<Trial> {
-        let e = sums.ellipse()?;
-        let (d, n, _) = Walk::new(&e).measure(s.at);
-        let along = s.towards_bright.dot(&n);
-        if d.abs() > 2.5 || along.abs() < 0.9 {
-            return None;
+    /// Part of an ellipse that may have edges, judged from a few places at equal parameters; nothing for one that is no contour.
+    fn glance(&self, e: &Ellipse2, bright_inside: bool) -> f64 {
+        if !self.is_sound(e) {
+            return 0.0;
         }
-        self.judge(&e, along < 0.0, 3.0, bar)
+        let sign = if bright_inside { -1.0 } else { 1.0 };
+        let (mut seen, mut likely) = (0usize, 0usize);
+        self.turns.round(Walk::new(e), GLANCES, |p, n| {
+            let raw = self.lens.raw(p);
+            if self.picture.contains(raw, 6.0) {
+                seen += 1;
+                likely += usize::from(self.may_have_edge(raw, n * sign));
+            }
+        });
+        likely as f64 / seen.max(1) as f64
+    }
+
+    fn is_sound(&self, e: &Ellipse2) -> bool {
+        let most = 1.5 * self.map.width().max(self.map.height()) as f64;
+        e.b > 4.0 && e.a < most && e.b > 0.04 * e.a
     }
 
     /// Judges an ellipse by the edges along it; `None` as soon as its score cannot exceed the bar any more.
     fn judge(&self, e: &Ellipse2, bright_inside: bool, tolerance: f64, bar: f64) -> Option<Trial> {
-        let most = 1.5 * self.map.width().max(self.map.height()) as f64;
-        if !(e.b > 4.0 && e.a < most && e.b > 0.04 * e.a) {
+        if !self.is_sound(e) {
             return None;
         }
         let w = Walk::new(e);
         let sign = if bright_inside { -1.0 } else { 1.0 };
         let root = w.perimeter().sqrt();
+        // Complete, it would score its root.
+        if root <= bar {
+            return None;
+        }
         let score = |hits: usize, seen: usize| {
             let coverage = hits as f64 / seen.max(1) as f64;
             coverage * coverage * root
         };
-        let places = w.places(3.0, MOST_PLACES, &self.turn);
-        let (mut seen, mut hits) = (0usize, Vec::with_capacity(places.len()));
+        let places = w.places(3.0, &self.turns);
+        // Places in the picture that may have an edge: most of a wrong trial's have none, and tell so at a glance.
+        let (mut seen, mut likely) = (0usize, Vec::with_capacity(places.len()));
         for (i, (p, n)) in places.iter().enumerate() {
             let raw = self.lens.raw(*p);
             if !self.picture.contains(raw, 6.0) {
                 continue;
             }
             seen += 1;
-            let mut best = (tolerance, None);
-            self.map.near(raw, tolerance.ceil() as i32).for_each(|(k, _)| {
-                let Some(i) = self.arcs.ideal.get(k) else { return };
-                let d = i.at - p;
-                let off = d.dot(n).abs();
-                if off < best.0 && i.towards_bright.dot(n) * sign > 0.94 && d.norm() < tolerance + 1.5 {
-                    best = (off, Some(k as u32));
-                }
-            });
-            match best.1 {
-                Some(k) => hits.push(k),
-                None => {
-                    let more = places.len() - i - 1;
-                    if score(hits.len() + more, seen + more) <= bar {
-                        return None;
-                    }
+            if self.may_have_edge(raw, n * sign) {
+                likely.push((raw, *p, *n));
+            } else {
+                let more = places.len() - i - 1;
+                if score(likely.len() + more, seen + more) <= bar {
+                    return None;
                 }
             }
         }
         if seen * 5 < places.len() * 2 {
             return None;
+        }
+        let mut hits = Vec::with_capacity(likely.len());
+        for (i, (raw, p, n)) in likely.iter().enumerate() {
+            let mut best = (tolerance, None);
+            self.map.within(*raw, *raw, (tolerance.ceil() as i32).min(REACH), |k, _, _| {
+                let Some(i) = self.arcs.ideal.get(k) else { return };
+                let d = i.at - p;
+                let off = d.dot(n).abs();
+                if off < best.0 && i.towards_bright.dot(n) * sign > ALONG && d.norm() < tolerance + 1.5 {
+                    best = (off, Some(k as u32));
+                }
+            });
+            match best.1 {
+                Some(k) => hits.push(k),
+                None if score(hits.len() + likely.len() - i - 1, seen) <= bar => return None,
+                None => {}
+            }
         }
         let coverage = hits.len() as f64 / seen.max(1) as f64;
         Some(Trial { ellipse: *e, bright_inside, coverage, score: score(hits.len(), seen), hits })

@@ -4,6 +4,7 @@
 //! each trial ellipse is judged by how much of it carries edges of the right direction. The best few are fitted again to the edges they gathered until
 //! they stop changing, then the edges in a narrow band are taken by consensus, thinned to independent ones and refined.
 
+mod directions;
 pub(in crate::offline) mod follow;
 mod grow;
 pub(in crate::offline) mod quick_fit;
@@ -11,8 +12,9 @@ pub mod select;
 mod through;
 
 use crate::offline::conic::robust::median;
+use crate::offline::contour::directions::Directions;
 use crate::offline::contour::grow::Trial;
-use crate::offline::contour::quick_fit::{Sums, Turn, Walk};
+use crate::offline::contour::quick_fit::{Sums, Turns, Walk};
 use crate::offline::edges::arcs::Arcs;
 use crate::offline::edges::lens::Lens;
 use crate::offline::edges::picture::Picture;
@@ -55,7 +57,9 @@ pub struct ViewEdges<'a> {
     longest: Vec<u32>,
     blur: OnceCell<f64>,
     /// Sines and cosines for walking round trial ellipses.
-    turn: Turn,
+    turns: Turns,
+    /// Where edges of which directions are, for trial ellipses.
+    directions: Directions,
     /// Edges brought to their place, by index: contours that compete share most of theirs.
     refined: RefCell<HashMap<u32, Option<Refined>>>,
     /// Contours with what became of them when their edges were told apart: each is paired with several of the other view.
@@ -138,9 +142,10 @@ impl<'a> ViewEdges<'a> {
             .collect();
         let mut longest: Vec<u32> = (0..arcs.arcs.len() as u32).collect();
         longest.sort_by_key(|k| std::cmp::Reverse(arcs.arcs.get(*k as usize).map_or(0, |a| a.edges.len())));
-        let turn = Turn::new(grow::MOST_PLACES);
+        let turns = Turns::new(grow::MOST_PLACES);
+        let directions = Directions::new(map.width(), map.height());
         let (refined, sharp) = (RefCell::default(), RefCell::default());
-        Self { picture, map, arcs, lens, samples, longest, blur: OnceCell::new(), turn, refined, sharp }
+        Self { picture, map, arcs, lens, samples, longest, blur: OnceCell::new(), turns, directions, refined, sharp }
     }
 
     /// The contour of a trial: edges by consensus, thinned, refined, with their ellipse. `None` when too little is left.

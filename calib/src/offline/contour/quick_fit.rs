@@ -6,6 +6,7 @@
 use crate::offline::rim::model::Ellipse2;
 use graspd_rt::geom::Pixel;
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
+use std::cell::OnceCell;
 
 /// Sums of products of `(x^2, xy, y^2, x, y, 1)` over points, about a chosen origin and in a chosen unit.
 #[derive(Clone, Copy, Debug)]
@@ -147,11 +148,10 @@ impl Walk {
         self.evenly(n, &Turn::new(n)).into_iter().map(|p| p.t).collect()
     }
 
-    /// Points and outward unit normals at equal arc lengths of about `step` pixels. A turn made for `most` places is used where it fits.
-    pub(in crate::offline) fn places(&self, step: f64, most: usize, turn: &Turn) -> Vec<(Pixel, Pixel)> {
-        let n = self.count(step, most);
-        let own = if turn.n == n { None } else { Some(Turn::new(n)) };
-        let places = self.evenly(n, own.as_ref().unwrap_or(turn));
+    /// Points and outward unit normals at equal arc lengths of about `step` pixels, as many as `turns` are for at most.
+    pub(in crate::offline) fn places(&self, step: f64, turns: &Turns) -> Vec<(Pixel, Pixel)> {
+        let n = self.count(step, turns.most());
+        let places = turns.with(n, |turn| self.evenly(n, turn));
         places.into_iter().map(|p| self.at_sin_cos(p.sin, p.cos)).collect()
     }
 
@@ -168,9 +168,12 @@ impl Walk {
             *l = total;
         }
         let mut out = Vec::with_capacity(n);
+        let middle = |k: usize| total * (k as f64 + 0.5) / n as f64;
+        let mut next = middle(0);
         for (done, p) in length.iter().zip(&turn.fine) {
-            if *done >= total * (out.len() as f64 + 0.5) / n as f64 && out.len() < n {
+            if *done >= next && out.len() < n {
                 out.push(*p);
+                next = middle(out.len());
             }
         }
         out
@@ -185,22 +188,53 @@ struct Parameter {
     cos: f64,
 }
 
+/// The steps of walks once round, by their number of places, each made when it is first asked for.
+#[derive(Clone, Debug)]
+pub(in crate::offline) struct Turns(Vec<OnceCell<Turn>>);
+
+impl Turns {
+    /// For walks of up to `most` places.
+    pub(in crate::offline) fn new(most: usize) -> Self {
+        Self(vec![OnceCell::new(); most + 1])
+    }
+
+    fn most(&self) -> usize {
+        self.0.len().saturating_sub(1)
+    }
+
+    /// Gives points and outward unit normals of a walk to a function: `4 n` at equal parameters.
+    pub(in crate::offline) fn round(&self, walk: Walk, n: usize, mut take: impl FnMut(Pixel, Pixel)) {
+        self.with(n, |turn| {
+            for p in &turn.fine {
+                let (at, normal) = walk.at_sin_cos(p.sin, p.cos);
+                take(at, normal);
+            }
+        });
+    }
+
+    fn with<T>(&self, n: usize, use_it: impl FnOnce(&Turn) -> T) -> T {
+        match self.0.get(n) {
+            Some(kept) => use_it(kept.get_or_init(|| Turn::new(n))),
+            None => use_it(&Turn::new(n)),
+        }
+    }
+}
+
 /// The steps of a walk once round with a number of places.
 #[derive(Clone, Debug)]
-pub(in crate::offline) struct Turn {
-    n: usize,
+struct Turn {
     fine: Vec<Parameter>,
 }
 
 impl Turn {
-    pub(in crate::offline) fn new(n: usize) -> Self {
+    fn new(n: usize) -> Self {
         let dt = std::f64::consts::TAU / (4 * n) as f64;
         let fine = (0..4 * n).map(|k| {
             let t = (k as f64 + 0.5) * dt;
             let (sin, cos) = t.sin_cos();
             Parameter { t, sin, cos }
         });
-        Self { n, fine: fine.collect() }
+        Self { fine: fine.collect() }
     }
 }
 

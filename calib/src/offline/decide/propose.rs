@@ -2,8 +2,8 @@
 
 use crate::offline::contour::quick_fit::Walk;
 use crate::offline::contour::select::Candidate;
-use crate::offline::contour::{Contour, ViewEdges};
-use crate::offline::rim::model::{Options, Outline, Projection, Reconstruction, RimChoice};
+use crate::offline::contour::{Contour, ViewEdges, alike};
+use crate::offline::rim::model::{Ellipse2, Options, Outline, Projection, Reconstruction, RimChoice};
 use crate::offline::rim::reconstruct::reconstruct;
 
 /// A rim proposed to the operator.
@@ -26,15 +26,21 @@ impl Proposal {
 
 /// Seeds tried in a view: arcs that turn, longest first.
 const SEEDS: usize = 120;
+/// Part of an ellipse that has to carry edges.
+const COVERED: f64 = 0.5;
+/// Part that has to carry edges before a trial ellipse is settled on the edges that it gathers: less than in the end, as settling gathers more.
+const PROMISING: f64 = 0.4;
 /// Ellipses kept of a view.
 const KEPT: usize = 40;
 
-/// Every ellipse worth mentioning in one view, best first.
-pub fn ellipses(edges: &ViewEdges<'_>) -> Vec<Contour> {
+/// Every ellipse worth mentioning in one view, best first. `watch` is told what part of the seeds is done.
+pub fn ellipses(edges: &ViewEdges<'_>, mut watch: impl FnMut(f64)) -> Vec<Contour> {
     let mut seeds: Vec<_> = edges.arcs.arcs.iter().filter(|a| a.turn.abs() > 0.35 && a.edges.len() >= 16).collect();
     seeds.sort_by(|a, b| (b.turn.abs() * b.edges.len() as f64).total_cmp(&(a.turn.abs() * a.edges.len() as f64)));
+    seeds.truncate(SEEDS);
     let mut out: Vec<Contour> = Vec::new();
-    for arc in seeds.into_iter().take(SEEDS) {
+    for (k, arc) in seeds.iter().enumerate() {
+        watch(k as f64 / seeds.len() as f64);
         let Some(seed) = arc.edges.get(arc.edges.len() / 2) else { continue };
         let Some(at) = edges.arcs.ideal.get(*seed as usize) else { continue };
         // An arc that lies on an ellipse already found says nothing new.
@@ -46,18 +52,15 @@ pub fn ellipses(edges: &ViewEdges<'_>) -> Vec<Contour> {
         if known {
             continue;
         }
-        for t in edges.trials(*seed as usize, 1) {
-            if t.coverage < 0.5 {
-                continue;
-            }
-            if let Some(c) = edges.contour(&t).filter(|c| c.coverage > 0.5 && c.rms_px < 0.6 && c.points.len() >= 20) {
-                let new = !out.iter().any(|o| {
-                    crate::offline::contour::alike(&o.ellipse, &c.ellipse) && o.bright_inside == c.bright_inside
-                });
-                if new {
-                    out.push(c);
-                }
-            }
+        let is_known = |out: &[Contour], e: &Ellipse2, bright_inside: bool| {
+            out.iter().any(|o| alike(&o.ellipse, e) && o.bright_inside == bright_inside)
+        };
+        // Nor does one that leads to it: most of the time would be spent on finding it again.
+        let trial = edges.promising(*seed as usize, PROMISING).filter(|t| t.coverage >= COVERED);
+        let Some(trial) = trial.filter(|t| !is_known(&out, &t.ellipse, t.bright_inside)) else { continue };
+        let contour = edges.contour(&trial).filter(|c| c.coverage > COVERED && c.rms_px < 0.6 && c.points.len() >= 20);
+        if let Some(c) = contour.filter(|c| !is_known(&out, &c.ellipse, c.bright_inside)) {
+            out.push(c);
         }
     }
     out.sort_by(|a, b| worth(b).total_cmp(&worth(a)));
@@ -69,11 +72,18 @@ fn worth(c: &Contour) -> f64 {
     c.coverage * c.coverage * (c.points.len() as f64).sqrt() / (0.15 + c.rms_px)
 }
 
-/// Pairs the ellipses of both views that reconstruct to a rim, best first, at most `most`.
-pub fn propose(views: &[ViewEdges<'_>; 2], p: [&Projection; 2], options: &Options, most: usize) -> Vec<Proposal> {
+/// Pairs the ellipses of both views that reconstruct to a rim, best first, at most `most`. `watch` is told what part of the work is done.
+pub fn propose(
+    views: &[ViewEdges<'_>; 2],
+    p: [&Projection; 2],
+    options: &Options,
+    most: usize,
+    watch: &mut dyn FnMut(f64),
+) -> Vec<Proposal> {
     let options =
         Options { rim: if options.rim == RimChoice::RoundBar { RimChoice::Edge } else { options.rim }, ..*options };
-    let [left, right] = [ellipses(&views[0]), ellipses(&views[1])];
+    let left = ellipses(&views[0], |part| watch(0.5 * part));
+    let right = ellipses(&views[1], |part| watch(0.5 + 0.5 * part));
     let mut found: Vec<(f64, usize, usize, Reconstruction)> = Vec::new();
     for (i, l) in left.iter().enumerate() {
         let a = l.edge_points(Outline::Outer);

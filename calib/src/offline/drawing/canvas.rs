@@ -7,9 +7,11 @@ use embedded_graphics::mono_font::{MonoFont, MonoTextStyle, iso_8859_1};
 use embedded_graphics::pixelcolor::BinaryColor;
 use embedded_graphics::text::{Baseline, Text};
 use graspd_rt::geom::Pixel;
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder};
 use tiny_skia::{
-    Color, FillRule, LineCap, LineJoin, Paint, PathBuilder, Pixmap, PixmapPaint, PremultipliedColorU8, Rect, Stroke,
-    StrokeDash, Transform,
+    Color, FillRule, LineCap, LineJoin, Paint, PathBuilder, Pixmap, PremultipliedColorU8, Rect, Stroke, StrokeDash,
+    Transform,
 };
 
 /// A colour as red, green, blue, opacity (0 to 255).
@@ -167,9 +169,16 @@ impl Canvas {
         self.text(top, text, face, scale, colour);
     }
 
-    /// Another drawing laid on this one.
+    /// Another drawing laid on this one, which it covers: neither lets anything show through.
     pub fn place(&mut self, x: i32, y: i32, other: &Self) {
-        self.pixmap.draw_pixmap(x, y, other.pixmap.as_ref(), &PixmapPaint::default(), Transform::identity(), None);
+        // Where it begins here, and what of it is cut off.
+        let begin = |at: i32| (at.max(0) as usize, at.min(0).unsigned_abs() as usize);
+        let ((x, left), (y, above)) = (begin(x), begin(y));
+        let (own, width) = (self.pixmap.width().max(1) as usize, other.pixmap.width().max(1) as usize);
+        let lines = self.pixmap.pixels_mut().chunks_exact_mut(own).skip(y);
+        for (line, source) in lines.zip(other.pixmap.pixels().chunks_exact(width).skip(above)) {
+            line.iter_mut().skip(x).zip(source.iter().skip(left)).for_each(|(q, s)| *q = *s);
+        }
     }
 
     /// Fills the drawing with grey values, row by row, each times a factor (0 to 1).
@@ -184,7 +193,13 @@ impl Canvas {
 
     /// The drawing as a PNG file.
     pub fn png(&self) -> Option<Vec<u8>> {
-        self.pixmap.encode_png().ok()
+        // Nothing shows through, so the opacity is left out; and a file that is written on every plan is worth a fifth more bytes for a tenth of the time.
+        let opaque: Vec<u8> = self.pixmap.pixels().iter().flat_map(|p| [p.red(), p.green(), p.blue()]).collect();
+        let mut file = Vec::new();
+        PngEncoder::new_with_quality(&mut file, CompressionType::Fast, FilterType::Adaptive)
+            .write_image(&opaque, self.pixmap.width(), self.pixmap.height(), ExtendedColorType::Rgb8)
+            .ok()?;
+        Some(file)
     }
 }
 

@@ -39,13 +39,19 @@ impl<'a> Panel<'a> {
     pub(in crate::offline) fn new(picture: &Picture, view: View, rig: &'a RigFile, zoom: f64) -> Option<Self> {
         let (w, h) = ((picture.width() as f64 * zoom).round() as u32, (picture.height() as f64 * zoom).round() as u32);
         let mut canvas = Canvas::new(w, h, BACK)?;
-        for (i, q) in canvas.pixmap.pixels_mut().iter_mut().enumerate() {
-            let (x, y) = (i % w as usize, i / w as usize);
-            let v = sample(picture, (x as f64 + 0.5) / zoom - 0.5, (y as f64 + 0.5) / zoom - 0.5);
-            // A little darker and cooler than life, so that the drawing stands out.
-            let tone = |k: f64| (v * k).round().clamp(0.0, 255.0) as u8;
-            if let Some(c) = tiny_skia::PremultipliedColorU8::from_rgba(tone(0.80), tone(0.83), tone(0.88), 255) {
-                *q = c;
+        let across = steps(w, zoom, picture.width());
+        let down = steps(h, zoom, picture.height());
+        for (line, y) in canvas.pixmap.pixels_mut().chunks_exact_mut(w.max(1) as usize).zip(&down) {
+            let rows = [picture.row(y.from), picture.row(y.to)];
+            for (q, x) in line.iter_mut().zip(&across) {
+                let at = |row: &[u8], i: usize| row.get(i).map_or(0.0, |v| f64::from(*v));
+                let mix = |row: &[u8]| at(row, x.from) * (1.0 - x.part) + at(row, x.to) * x.part;
+                let v = mix(rows[0]) * (1.0 - y.part) + mix(rows[1]) * y.part;
+                // A little darker and cooler than life, so that the drawing stands out.
+                let tone = |k: f64| (v * k + 0.5) as u8;
+                if let Some(c) = tiny_skia::PremultipliedColorU8::from_rgba(tone(0.80), tone(0.83), tone(0.88), 255) {
+                    *q = c;
+                }
             }
         }
         Some(Self { canvas, zoom, lens: Lens::new(rig.rig.camera(view)), view, rig })
@@ -166,13 +172,23 @@ impl<'a> Panel<'a> {
     }
 }
 
-/// Bilinear grey value, the border repeated.
-fn sample(p: &Picture, x: f64, y: f64) -> f64 {
-    let (x, y) = (x.clamp(0.0, p.width() as f64 - 1.0), y.clamp(0.0, p.height() as f64 - 1.0));
-    let (i, j) = (x as usize, y as usize);
-    let (a, b) = (x - i as f64, y - j as f64);
-    let at = |i: usize, j: usize| p.row(j.min(p.height() - 1)).get(i.min(p.width() - 1)).map_or(0.0, |v| f64::from(*v));
-    (at(i, j) * (1.0 - a) + at(i + 1, j) * a) * (1.0 - b) + (at(i, j + 1) * (1.0 - a) + at(i + 1, j + 1) * a) * b
+/// Where a drawn row or column lies between two of the picture's.
+struct Step {
+    from: usize,
+    to: usize,
+    part: f64,
+}
+
+/// The steps of `count` drawn rows or columns over `size` of the picture, the border repeated.
+fn steps(count: u32, zoom: f64, size: usize) -> Vec<Step> {
+    let last = size.saturating_sub(1);
+    (0..count)
+        .map(|k| {
+            let at = ((f64::from(k) + 0.5) / zoom - 0.5).clamp(0.0, last as f64);
+            let from = at as usize;
+            Step { from, to: (from + 1).min(last), part: at - from as f64 }
+        })
+        .collect()
 }
 
 /// Boxes of the gripper at a pose, fingers in another colour than the body.

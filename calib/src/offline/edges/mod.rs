@@ -129,26 +129,56 @@ impl EdgeMap {
 
     /// Edge points found in the pixels at most `radius` away, with their index, in raster order.
     pub fn near(&self, p: Pixel, radius: i32) -> impl Iterator<Item = (usize, &Edge)> {
-        let span = |middle: f64, size: usize| {
-            let middle = middle.round() as i32;
-            let last = i32::try_from(size).unwrap_or(i32::MAX) - 1;
-            (middle.saturating_sub(radius).max(0), middle.saturating_add(radius).min(last))
-        };
-        let ((x0, x1), (y0, y1)) = (span(p.x, self.width), span(p.y, self.height));
-        // Empty where the picture does not reach.
-        let (x0, x1) = (x0 as u32, if x0 <= x1 { Some(x1 as u32) } else { None });
-        let blocks = self.width.div_ceil(BLOCK);
-        (y0..=y1).filter_map(move |y| Some((y as usize, x1?))).flat_map(move |(y, x1)| {
-            let start = |x: u32, more: usize| self.starts.get(y * blocks + x as usize / BLOCK + more);
-            let (from, to) = match (start(x0, 0), start(x1, 1)) {
-                (Some(a), Some(b)) => (*a as usize, *b as usize),
-                _ => (0, 0),
-            };
-            let columns = self.columns.get(from..to).unwrap_or(&[]);
-            let edges = self.edges.get(from..to).unwrap_or(&[]);
+        let ((x0, x1), ys) = self.rows_within(p, p, radius);
+        ys.flat_map(move |y| {
+            let (from, columns, edges) = self.blocks(y, x0, x1);
             let inside = columns.iter().zip(edges).enumerate().filter(move |(_, (x, _))| x0 <= **x && **x <= x1);
             inside.map(move |(k, (_, e))| (from + k, e))
         })
+    }
+
+    /// The same for all pixels from one corner of a rectangle to the other, given to a function by index, column and row: for where most time is spent.
+    pub(in crate::offline) fn within(
+        &self,
+        first: Pixel,
+        last: Pixel,
+        radius: i32,
+        mut take: impl FnMut(usize, usize, usize),
+    ) {
+        let ((x0, x1), ys) = self.rows_within(first, last, radius);
+        for y in ys {
+            let (from, columns, _) = self.blocks(y, x0, x1);
+            for (k, x) in columns.iter().enumerate() {
+                if x0 <= *x && *x <= x1 {
+                    take(from + k, *x as usize, y);
+                }
+            }
+        }
+    }
+
+    /// Columns from and to, and rows, of the pixels at most `radius` from a rectangle; no rows where the picture does not reach.
+    fn rows_within(&self, first: Pixel, last: Pixel, radius: i32) -> ((u32, u32), std::ops::Range<usize>) {
+        let span = |first: f64, last: f64, size: usize| {
+            let end = i32::try_from(size).unwrap_or(i32::MAX) - 1;
+            let (from, to) = (first.round() as i32, last.round() as i32);
+            (from.saturating_sub(radius).max(0), to.saturating_add(radius).min(end))
+        };
+        let ((x0, x1), (y0, y1)) = (span(first.x, last.x, self.width), span(first.y, last.y, self.height));
+        if x0 > x1 || y0 > y1 {
+            return ((0, 0), 0..0);
+        }
+        ((x0 as u32, x1 as u32), y0 as usize..y1 as usize + 1)
+    }
+
+    /// The edge points of a row's blocks from one column to another: the first's index, their columns, and they.
+    fn blocks(&self, y: usize, x0: u32, x1: u32) -> (usize, &[u32], &[Edge]) {
+        let row = y * self.width.div_ceil(BLOCK);
+        let (from, to) =
+            match (self.starts.get(row + x0 as usize / BLOCK), self.starts.get(row + x1 as usize / BLOCK + 1)) {
+                (Some(a), Some(b)) => (*a as usize, *b as usize),
+                _ => (0, 0),
+            };
+        (from, self.columns.get(from..to).unwrap_or(&[]), self.edges.get(from..to).unwrap_or(&[]))
     }
 }
 
