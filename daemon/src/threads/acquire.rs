@@ -48,6 +48,9 @@ fn words(failure: &AcquireFailure) -> String {
             "a pose was found but does not hold in the pictures ({} and {} marks, residual {residual_px:.1} px)",
             seen[0], seen[1]
         ),
+        AcquireFailure::RigOff { sigmas, residual_px } => format!(
+            "the marks fit only with a rig {sigmas:.0} times as wrong as it states (residual {residual_px:.1} px): a camera was moved, rig.toml is another rig's, or this gripper has another size; check the calibration, or state its error in [quality]"
+        ),
         AcquireFailure::Ambiguous { .. } => {
             "two poses explain the pictures equally well: the mark that tells them apart is hidden, or the layout is symmetric".into()
         }

@@ -62,6 +62,11 @@ impl RigError {
         RigOffset::from([r, r, r, self.focal, self.focal_difference, p, p, p, p])
     }
 
+    /// Length of an offset in deviations: the root of the sum of squares.
+    pub fn sigmas(&self, offset: &RigOffset) -> f64 {
+        math::sqrt(offset.component_div(&self.deviations().map(|d| d.max(1e-12))).norm_squared())
+    }
+
     /// Deviation of the distance of a mark's image from the epipolar line of its other image, pixels, for a point of the left
     /// frame. `None` where it is behind a camera, or on the line through both.
     pub fn epipolar_sigma_px(&self, rig: &Rig, x_left: &Vec3) -> Option<f64> {
