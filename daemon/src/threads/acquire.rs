@@ -64,7 +64,7 @@ fn words(failure: &AcquireFailure) -> String {
 pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &AcquireReport) -> Result<(), ShmError> {
     let mut subscriber = FrameSubscriber::new(node, policy(config))?;
     let mut scratch = Box::new(AcquireScratch::new());
-    let settings = AcquireSettings::default();
+    let settings = AcquireSettings { rig_error: config.rig.error(), ..AcquireSettings::default() };
     let mut converted = [Vec::new(), Vec::new()];
     while !shared.ending() {
         std::thread::sleep(Duration::from_millis(20));

@@ -26,8 +26,8 @@ pub struct RigWatchSettings {
     pub motion_share: f64,
     /// The same at rest, metres (a turn by this over 0.1 m). Default 20 um.
     pub rest_m: f64,
-    /// Chi-squared by which a change has to explain a frame, or the window, better. Default 75: of 15 degrees of freedom once in
-    /// 10^9 frames.
+    /// Chi-squared by which a change has to explain a frame, or the window, better; half of it in the frame that confirms. Default 45:
+    /// of the seven degrees of freedom that marks see of a change, chance gives both once in 3 * 10^9 frames.
     pub significant: f64,
     /// A significant change that leads the gripper astray by less than this is a warning, metres (unit-scaled). Default 0.0005.
     pub harmless_m: f64,
@@ -42,7 +42,7 @@ impl Default for RigWatchSettings {
             mark_px: 0.05,
             motion_share: 0.03,
             rest_m: 2e-5,
-            significant: 75.0,
+            significant: 45.0,
             harmless_m: 5e-4,
             confirm: 2,
         }
@@ -68,9 +68,9 @@ pub struct RigHealth {
 const LEARN_FRAMES: u32 = 6;
 /// Frames after which the offset is what later windows are held against.
 const BASE_FRAMES: u32 = 20;
-/// Share of the offset's covariance that each frame gives back to the stated error: 0.02 px a frame, so that the filter never
+/// Share of the offset's covariance that each frame gives back to the stated error: 0.006 px a frame, so that the filter never
 /// believes to know the offset better than marks can be measured.
-const FORGET: f64 = 2e-4;
+const FORGET: f64 = 2e-5;
 /// Fading of the window, frames.
 const WINDOW: f64 = 60.0;
 /// Length that makes a turn comparable with a shift, metres.
@@ -233,7 +233,9 @@ impl RigWatch {
         let (chi2, step) = gain(&information, &score, &narrow, &wide)?;
         let learnt = s.frames >= LEARN_FRAMES;
         self.health.evidence[0] = if learnt { chi2 / self.settings.significant } else { 0.0 };
-        if self.health.evidence[0] >= 1.0 {
+        // A second frame is held to half: it comes after twice the motion, and two by chance are rarer than one.
+        let needed = if self.suspect[0] > 0 { 0.5 } else { 1.0 };
+        if self.health.evidence[0] >= needed {
             self.suspect[0] += 1;
             if self.suspect[0] >= self.settings.confirm {
                 // What the loop would make of it: the pose that the marks alone ask for, against where the gripper is.
