@@ -3,7 +3,7 @@
 
 mod support;
 
-use graspd_rt::geom::{Pose, Rig, Vec3, View, log_pose};
+use graspd_rt::geom::{Pose, Rig, RigError, Vec3, View, log_pose};
 use graspd_rt::gripper::{Gripper, Mark};
 use graspd_rt::image::ImageView;
 use graspd_rt::online::acquire::{
@@ -165,6 +165,82 @@ fn a_rig_that_was_knocked_is_still_enough_to_find_the_gripper() {
         assert_eq!(v.status, VisionStatus::Tracking, "scene {n}");
         assert!(v.seen.iter().all(|s| *s >= 12), "scene {n}: {:?}, residual {} px", v.seen, v.residual_px);
     }
+}
+
+/// A rig drawn from the default prior, `by` times its deviations: what an unstated calibration may be off by.
+fn drawn(random: &mut Random, rig: &Rig, by: f64) -> Rig {
+    rig.offset(&RigError::default().scaled(by).deviations().map(|d| d * random.normal()))
+}
+
+/// Every rig within the stated error serves: found, tracked at once with nearly all marks, and said how far off it seems.
+#[test]
+fn a_rig_that_is_off_within_its_stated_error_is_served() {
+    let (believed, gripper) = (rig(true), gripper());
+    let mut scratch = scratch();
+    let mut random = Random(21);
+    let (mut worst, mut largest) = (0.0_f64, 0.0_f64);
+    let scenes = 60;
+    for n in 0..scenes {
+        let truth_rig = drawn(&mut random, &believed, 1.0);
+        let truth = pose(&mut random, 0.5);
+        let others = clutter(&mut random, 12);
+        let pair = scene(&mut random, &truth_rig, &gripper, &truth, &others, &[], 10);
+        let a = run(&believed, &gripper, &pair, &mut scratch).unwrap_or_else(|e| panic!("scene {n}: {e:?}"));
+        // What the rig's error makes of a pose: a pixel of disparity is 4 mm here.
+        let (mm, deg) = error(&truth, &a.left_from_gripper);
+        assert!(mm < 60.0 && deg < 4.0, "scene {n}: {mm} mm {deg} deg");
+        assert!(a.inner_residual_px < 0.2, "scene {n}: {} px with the rig's offset taken out", a.inner_residual_px);
+        assert!(a.rig_sigmas < 5.0, "scene {n}: a rig {} of its deviations off", a.rig_sigmas);
+        let mut cycle = VisionCycle::new(believed, gripper.clone(), VisionSettings::default());
+        cycle.seed(a.left_from_gripper);
+        let v = cycle.step(&pair.frame(1), None).unwrap();
+        assert_eq!(v.status, VisionStatus::Tracking, "scene {n}: {} px", v.residual_px);
+        assert!(v.seen.iter().all(|s| *s >= 12), "scene {n}: {:?}, residual {} px", v.seen, v.residual_px);
+        worst = worst.max(v.residual_px);
+        largest = largest.max(a.rig_sigmas);
+    }
+    println!("{scenes} rigs served: residuals up to {worst:.2} px, up to {largest:.1} deviations off");
+    assert!(worst > 1.5, "these rigs are ones that a gate of 1.5 px refused: {worst}");
+}
+
+/// The wider gates are no licence: another gripper is refused, with the right rig and with one that is off.
+#[test]
+fn another_gripper_is_refused_whatever_the_rig() {
+    let (believed, ours) = (rig(true), gripper());
+    let mut scratch = scratch();
+    let mut random = Random(22);
+    let mut refused = 0;
+    for n in 0..60 {
+        let mut theirs = ours.clone();
+        match n % 3 {
+            // Every mark elsewhere by about a centimetre.
+            0 => theirs.marks.iter_mut().for_each(|m| {
+                let d = random.direction() * random.range(0.006, 0.016);
+                m.position += Vec3::new(d.x, d.y, 0.3 * d.z);
+            }),
+            // The same, seen in a mirror.
+            1 => theirs.marks.iter_mut().for_each(|m| {
+                m.position.x = -m.position.x;
+                m.normal.x = -m.normal.x;
+            }),
+            // The next size of the series.
+            _ => theirs.marks.iter_mut().for_each(|m| m.position *= 1.1),
+        }
+        let truth_rig = drawn(&mut random, &believed, if n % 2 == 0 { 1.0 } else { 0.0 });
+        let truth = pose(&mut random, 0.5);
+        let others = clutter(&mut random, 8);
+        let pair = scene(&mut random, &truth_rig, &theirs, &truth, &others, &[], 8);
+        let a = run(&believed, &ours, &pair, &mut scratch);
+        match &a {
+            Ok(a) => println!("scene {n}: {:?} {} {} {}", a.seen, a.residual_px, a.inner_residual_px, a.rig_sigmas),
+            Err(e) => {
+                refused += 1;
+                println!("scene {n}: {e:?}");
+            }
+        }
+    }
+    assert_eq!(refused, 60);
+    println!("{refused} of 60 other grippers refused");
 }
 
 #[test]

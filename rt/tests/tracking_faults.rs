@@ -171,7 +171,8 @@ fn a_prior_that_contradicts_the_last_pose_is_not_followed() {
     let (rig, gripper) = (*w.cycle.rig(), w.cycle.gripper().clone());
     let pair = render(&rig, &gripper, &w.truth, &Scene::default(), &Exposure::default(), &mut w.random, &mut |_, _| {});
     let wild = Pose::translation(0.2, 0.0, 0.0) * w.truth;
-    let v = w.cycle.step(&pair.frame(2), Some(wild)).unwrap();
+    w.cycle.step(&pair.frame(2), Some(w.truth)).unwrap();
+    let v = w.cycle.step(&pair.frame(3), Some(wild)).unwrap();
     assert_eq!(v.status, VisionStatus::Tracking);
     assert_eq!(w.cycle.faults().prior, 1);
 }

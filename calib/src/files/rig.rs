@@ -3,7 +3,7 @@
 use super::error::{self, FileError, Source};
 use super::hash::{ContentHash, Numbers};
 use super::pose::PoseRecord;
-use graspd_rt::geom::{Camera, CameraError, Distortion, Rig};
+use graspd_rt::geom::{Camera, CameraError, Distortion, Rig, RigError};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -35,6 +35,18 @@ pub struct Quality {
     /// Number of picture pairs used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pictures: Option<u32>,
+    /// One standard deviation of the relative rotation about each axis, rad.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rotation_rad: Option<f64>,
+    /// The same of the focal lengths, both together, relative.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub focal: Option<f64>,
+    /// The same of half their difference, relative.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub focal_difference: Option<f64>,
+    /// The same of each principal point's coordinates, pixels.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub principal_px: Option<f64>,
     /// Anything else worth keeping.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub note: Option<String>,
@@ -110,12 +122,26 @@ impl RigFile {
                 "give the translation in metres from a stereo calibration",
             ));
         }
+        if let Some(q) = &raw.quality {
+            stated_error(&src, q)?;
+        }
         Ok(Self { rig: Rig { left, right, right_from_left }, name: raw.name, date: raw.date, quality: raw.quality })
     }
 
     /// A rig without a history.
     pub fn new(rig: Rig) -> Self {
         Self { rig, name: None, date: None, quality: None }
+    }
+
+    /// The rig's own error as the file states it; the default for every figure that it does not state.
+    pub fn error(&self) -> RigError {
+        let d = RigError::default();
+        self.quality.as_ref().map_or(d, |q| RigError {
+            rotation_rad: q.rotation_rad.unwrap_or(d.rotation_rad),
+            focal: q.focal.unwrap_or(d.focal),
+            focal_difference: q.focal_difference.unwrap_or(d.focal_difference),
+            principal_px: q.principal_px.unwrap_or(d.principal_px),
+        })
     }
 
     /// Hash of the calibration itself: cameras and relative pose by their bits, not the file's comments, name or date.
@@ -158,6 +184,33 @@ impl RigFile {
     pub fn save(&self, path: &Path) -> Result<(), FileError> {
         error::write_text(path, &self.to_toml())
     }
+}
+
+/// Refuses a stated error that no calibration has: zero would take every gate away from noise, and beyond the upper ends a rig is
+/// not calibrated but guessed.
+fn stated_error(src: &Source<'_>, q: &Quality) -> Result<(), FileError> {
+    let figures = [
+        (
+            "rotation_rad",
+            q.rotation_rad,
+            1e-6..=0.02,
+            "one standard deviation of the relative rotation, rad (0.001 is 0.06 degrees)",
+        ),
+        ("focal", q.focal, 1e-6..=0.05, "one standard deviation of the focal lengths, relative (0.005 is 0.5 %)"),
+        (
+            "focal_difference",
+            q.focal_difference,
+            1e-6..=0.05,
+            "one standard deviation of half the focal lengths' difference, relative",
+        ),
+        ("principal_px", q.principal_px, 1e-3..=50.0, "one standard deviation of the principal points, pixels"),
+    ];
+    for (leaf, value, range, what) in figures {
+        if let Some(v) = value {
+            src.number(&format!("quality.{leaf}"), v, range, what)?;
+        }
+    }
+    Ok(())
 }
 
 fn raw_camera(c: &Camera) -> RawCamera {
@@ -269,6 +322,23 @@ rotation_vector_rad = [0.0, 0.3, 0.0]
         let c = RigFile::parse(&TEXT.replace("1199.5", "1199.6"), "rig.toml").unwrap();
         assert_eq!(a.id(), b.id());
         assert_ne!(a.id(), c.id());
+    }
+
+    #[test]
+    fn the_stated_error_is_read_and_the_default_fills_what_is_not_stated() {
+        let a = RigFile::parse(TEXT, "rig.toml").unwrap();
+        assert_eq!(a.error(), RigError::default());
+        let text = format!("{TEXT}\n[quality]\nrotation_rad = 2e-4\nprincipal_px = 0.3\n");
+        let b = RigFile::parse(&text, "rig.toml").unwrap();
+        assert_eq!(b.error(), RigError { rotation_rad: 2e-4, principal_px: 0.3, ..RigError::default() });
+        // How good a calibration is does not make it another one, and it survives writing.
+        assert_eq!(a.id(), b.id());
+        assert_eq!(RigFile::parse(&b.to_toml(), "rig.toml").unwrap().error(), b.error());
+        for bad in ["rotation_rad = 0.1", "focal = 0.0", "principal_px = nan", "focal_difference = -0.001"] {
+            let e = RigFile::parse(&format!("{TEXT}\n[quality]\n{bad}\n"), "rig.toml").unwrap_err().to_string();
+            let key = bad.split(' ').next().unwrap();
+            assert!(e.contains(&format!("quality.{key}")) && e.contains("standard deviation"), "{e}");
+        }
     }
 
     #[test]

@@ -48,6 +48,9 @@ fn words(failure: &AcquireFailure) -> String {
             "a pose was found but does not hold in the pictures ({} and {} marks, residual {residual_px:.1} px)",
             seen[0], seen[1]
         ),
+        AcquireFailure::RigOff { sigmas, residual_px } => format!(
+            "the marks fit only with a rig {sigmas:.0} times as wrong as it states (residual {residual_px:.1} px): a camera was moved, rig.toml is another rig's, or this gripper has another size; check the calibration, or state its error in [quality]"
+        ),
         AcquireFailure::Ambiguous { .. } => {
             "two poses explain the pictures equally well: the mark that tells them apart is hidden, or the layout is symmetric".into()
         }
@@ -61,7 +64,7 @@ fn words(failure: &AcquireFailure) -> String {
 pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &AcquireReport) -> Result<(), ShmError> {
     let mut subscriber = FrameSubscriber::new(node, policy(config))?;
     let mut scratch = Box::new(AcquireScratch::new());
-    let settings = AcquireSettings::default();
+    let settings = AcquireSettings { rig_error: config.rig.error(), ..AcquireSettings::default() };
     let mut converted = [Vec::new(), Vec::new()];
     while !shared.ending() {
         std::thread::sleep(Duration::from_millis(20));

@@ -8,6 +8,7 @@ use graspd_rt::arm::Dh;
 use graspd_rt::geom::Pose;
 use graspd_rt::image::ImageView;
 use graspd_rt::online::predict::{JointHistory, left_from_gripper_now};
+use graspd_rt::online::rig_watch::RigWatchSettings;
 use graspd_rt::online::{FrameLimits, StereoFrame, VisionCycle, VisionSettings};
 use graspd_shm::frame::{FramePolicy, FrameSubscriber, SourceEvent};
 use graspd_shm::{ShmError, ShmNode};
@@ -35,8 +36,6 @@ pub struct VisionWorker<'a> {
     history: JointHistory,
     dh: Dh,
     flange_from_gripper: Pose,
-    /// Pose and capture time of the last good result: what the joints' motion is added to.
-    last: Option<(u64, Pose)>,
     /// Mono8 copies for formats that are not; empty when the camera sends mono8.
     converted: [Vec<u8>; 2],
 }
@@ -60,6 +59,7 @@ impl<'a> VisionWorker<'a> {
     pub fn new(config: &Config, dh: Dh, node: &ShmNode, shared: &'a Shared) -> Result<Self, ShmError> {
         let subscriber = FrameSubscriber::new(node, policy(config))?;
         let settings = VisionSettings {
+            rig: RigWatchSettings { rig_error: config.rig.error(), ..RigWatchSettings::default() },
             frame: FrameLimits { max_skew_ns: (config.raw.vision.max_skew_ms * 1e6) as u64, ..FrameLimits::default() },
             ..VisionSettings::default()
         };
@@ -73,7 +73,6 @@ impl<'a> VisionWorker<'a> {
             history: JointHistory::default(),
             dh,
             flange_from_gripper,
-            last: None,
             converted: [pixels(&config.rig.rig.left), pixels(&config.rig.rig.right)],
         })
     }
@@ -94,7 +93,7 @@ impl<'a> VisionWorker<'a> {
             self.history.push(s.at_ns, &s.q);
         }
         let now = now_ns();
-        let Self { subscriber, cycle, history, dh, flange_from_gripper, last, converted, shared } = self;
+        let Self { subscriber, cycle, history, dh, flange_from_gripper, converted, shared } = self;
         let received = subscriber.newest(now);
         let counters = &shared.counters;
         counters.skipped.fetch_add(received.skipped, Ordering::Relaxed);
@@ -108,7 +107,6 @@ impl<'a> VisionWorker<'a> {
         };
         if matches!(received.source, Some(SourceEvent::First | SourceEvent::TakenOver)) {
             cycle.reset();
-            *last = None;
         }
         let Some(frame) = received.frame else {
             shared.needs_seed.store(cycle.needs_acquisition(), Ordering::Release);
@@ -145,14 +143,12 @@ impl<'a> VisionWorker<'a> {
             cycle.seed(moved(capture_ns, &left_from_gripper).unwrap_or(left_from_gripper));
             counters.acquired.fetch_add(1, Ordering::Relaxed);
         }
-        let prior = last.as_ref().and_then(|(at, pose)| moved(*at, pose));
+        let base_from_gripper = history.at(middle).map(|q| dh.base_from_gripper(&q, flange_from_gripper));
         let pair = StereoFrame { left, right, sequence: frame.sequence(), capture_ns: capture, now_ns: now };
-        match cycle.step(&pair, prior) {
+        match cycle.step(&pair, base_from_gripper) {
             // What the pictures say is then old, whatever their stamps say: let it age.
             Ok(_) if cycle.health().frozen_run >= FROZEN_FRAMES && moves(history, middle) => refuse(Refusal::Frozen),
             Ok(vision) => {
-                *last = (vision.status != graspd_rt::online::VisionStatus::Lost)
-                    .then_some((middle, vision.left_from_gripper));
                 counters.frames.fetch_add(1, Ordering::Relaxed);
                 shared.vision.put(vision);
                 shared.vision_seen.put(vision);

@@ -42,6 +42,8 @@ pub struct CommandCycle {
     vision: VisionWatch,
     history: JointHistory,
     setpoint: Option<SetPoint>,
+    /// How many times a camera had been found moved when the set-point was given.
+    setpoint_moves: Option<u32>,
     motion: Option<Motion>,
     probe: Option<Probe>,
     work: Work,
@@ -98,6 +100,7 @@ impl CommandCycle {
             limits,
             mode: Mode::Idle,
             setpoint: None,
+            setpoint_moves: None,
             motion: None,
             probe: None,
             work: Work::default(),
@@ -219,6 +222,8 @@ impl CommandCycle {
         }
         self.new_frame = false;
         if let Some(v) = input.vision {
+            // A set-point that was given before the first result holds for the rig which that one shows.
+            self.setpoint_moves = self.setpoint_moves.or(Some(v.rig.moves));
             let mount = &self.config.gripper.flange_from_gripper;
             let driven = self.mode.drives();
             match self.vision.offer(now, v, &self.history, &self.config.dh, mount, driven) {
@@ -254,7 +259,16 @@ impl CommandCycle {
         if self.broken_beats > 0 {
             return Some(FaultCause::LawBroken { beats: self.broken_beats });
         }
+        if let Some(astray_m) = self.camera_moved() {
+            return Some(FaultCause::CameraMoved { astray_m });
+        }
         self.vision.fault(now)
+    }
+
+    /// How far astray the set-point leads since a camera was moved after it; `None` where none was.
+    fn camera_moved(&self) -> Option<f64> {
+        let rig = self.vision.rig()?;
+        self.setpoint_moves.filter(|then| *then != rig.moves).map(|_| rig.astray_m)
     }
 
     /// What holds now.
@@ -320,7 +334,13 @@ impl CommandCycle {
         if !self.vision.tracking(now) {
             return Err(Reject::NoMarks);
         }
-        if self.setpoint.is_none() { Err(Reject::NoSetPoint) } else { Ok(()) }
+        if self.setpoint.is_none() {
+            return Err(Reject::NoSetPoint);
+        }
+        if self.camera_moved().is_some() {
+            return Err(Reject::CameraMoved);
+        }
+        if self.vision.one_view() { Err(Reject::OneView) } else { Ok(()) }
     }
 
     fn may_servo(&self, now: u64) -> Result<(), Reject> {
@@ -354,6 +374,7 @@ impl CommandCycle {
         }
         check::setpoint(&self.config, s)?;
         self.setpoint = Some(*s);
+        self.setpoint_moves = self.vision.rig().map(|r| r.moves);
         // What was armed was armed for another goal.
         if matches!(self.mode, Mode::Armed) {
             self.apply(Event::Disarm, Why::Request(RequestKind::Disarm), now, event);

@@ -5,11 +5,16 @@ use crate::arm::{Dh, Joints};
 use crate::geom::{Pose, log_pose};
 use crate::mode::{FaultCause, HoldCause};
 use crate::online::predict::JointHistory;
-use crate::online::screw::LawSettings;
+use crate::online::rig_watch::RigHealth;
+use crate::online::screw::{LawSettings, ViewMode};
 use crate::online::{Vision, VisionStatus};
 
 /// Pictures over which motion is compared.
 const WINDOW: usize = 6;
+
+/// Marks in a view below which it adds no depth, and results in a row after which that is no passing hand (80 ms at 60 Hz).
+const VIEW_MARKS: u8 = 3;
+const ONE_VIEW_RESULTS: u32 = 5;
 
 /// A vision result in use, and where the joints were when its pictures were taken.
 #[derive(Clone, Copy, Debug)]
@@ -50,6 +55,10 @@ pub(super) struct VisionWatch {
     jump_m: f64,
     mismatches: u32,
     mismatch: (f64, f64),
+    /// Results in a row in which one view showed next to nothing.
+    one_view: u32,
+    /// The rig as the newest result has it, refused ones included.
+    rig: Option<RigHealth>,
     good_since_ns: Option<u64>,
 }
 
@@ -78,6 +87,8 @@ impl VisionWatch {
             jump_m: 0.0,
             mismatches: 0,
             mismatch: (0.0, 0.0),
+            one_view: 0,
+            rig: None,
             good_since_ns: None,
         }
     }
@@ -92,6 +103,7 @@ impl VisionWatch {
         mount: &Pose,
         driven: bool,
     ) -> Taken {
+        self.rig = Some(vision.rig);
         let taken = self.judge(now_ns, vision, history, dh, mount, driven);
         match taken {
             Taken::Used => self.good_since_ns = self.good_since_ns.or(Some(now_ns)),
@@ -141,6 +153,8 @@ impl VisionWatch {
             }
         }
         self.jumps = 0;
+        let blind = self.law.views == ViewMode::Stereo && v.seen.iter().any(|s| *s < VIEW_MARKS);
+        self.one_view = if blind { self.one_view.saturating_add(1) } else { 0 };
         let delay = now.saturating_sub(capture);
         self.delay_ns = if self.delay_ns == 0 { delay } else { (self.delay_ns * 15 + delay) / 16 };
         self.compare_motion(&v.left_from_gripper, &q, dh, mount, driven);
@@ -171,6 +185,16 @@ impl VisionWatch {
 
     pub(super) fn seen(&self) -> Option<&Seen> {
         self.seen.as_ref()
+    }
+
+    /// The rig as the marks show it; `None` before the first result.
+    pub(super) fn rig(&self) -> Option<&RigHealth> {
+        self.rig.as_ref()
+    }
+
+    /// Whether two views are to be used and only one shows the marks.
+    pub(super) fn one_view(&self) -> bool {
+        self.one_view >= ONE_VIEW_RESULTS
     }
 
     /// Age of the picture in use, ns.
@@ -229,6 +253,9 @@ impl VisionWatch {
     pub(super) fn hold(&self) -> Option<HoldCause> {
         if self.lost >= 2 {
             return Some(HoldCause::MarksLost);
+        }
+        if let Some(seen) = self.seen.filter(|_| self.one_view()) {
+            return Some(HoldCause::OneView { seen: seen.vision.seen });
         }
         (self.skewed >= 3).then_some(HoldCause::Skew { skew_ns: self.skew_ns })
     }

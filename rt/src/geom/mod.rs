@@ -6,10 +6,12 @@
 
 mod camera;
 mod rig;
+mod rig_quality;
 mod twist;
 
 pub use camera::{Camera, CameraError, Distortion};
 pub use rig::{Rig, View};
+pub use rig_quality::{RIG_UNKNOWNS, RigError, RigJacobian, RigOffset};
 pub use twist::{Twist, adjoint, exp_twist, log_pose, transform_twist};
 
 use nalgebra::{Isometry3, Vector2, Vector3};

@@ -26,6 +26,11 @@ pub enum FaultCause {
         /// Greatest possible, metres.
         limit_m: f64,
     },
+    /// F-CAM-03: a camera was moved since the set-point was given: what was planned is no longer where the images say.
+    CameraMoved {
+        /// How far that leads the gripper astray, metres (unit-scaled).
+        astray_m: f64,
+    },
     /// F-MRK-02: the pictures and the joints disagree about the motion (frozen picture, wrong camera, slipping mount).
     MotionMismatch {
         /// Motion by the joints over the window, metres (unit-scaled).
@@ -142,6 +147,7 @@ impl FaultCause {
         match self {
             FaultCause::FramesStale { .. } => "F-CAM-01",
             FaultCause::FrameStamps { .. } => "F-CAM-02",
+            FaultCause::CameraMoved { .. } => "F-CAM-03",
             FaultCause::MarksJumped { .. } => "F-MRK-01",
             FaultCause::MotionMismatch { .. } => "F-MRK-02",
             FaultCause::WrongWay { .. } => "F-LAW-01",
@@ -198,6 +204,11 @@ impl fmt::Display for FaultCause {
             FaultCause::FrameStamps { count } => {
                 write!(f, "{count} pictures in a row with impossible time stamps: check the camera driver's clock")
             }
+            FaultCause::CameraMoved { astray_m } => write!(
+                f,
+                "a camera was moved since the set-point was given, which would lead the gripper {:.1} mm astray: fix the camera, check the calibration, take new images and plan again",
+                astray_m * 1e3
+            ),
             FaultCause::MarksJumped { jump_m, limit_m } => write!(
                 f,
                 "the marks jumped by {:.1} mm, more than the arm can move ({:.1} mm)",
@@ -311,6 +322,11 @@ pub enum HoldCause {
     },
     /// H-09: the operator's lease ran out (O03).
     LeaseLost,
+    /// H-12: both views are to be used and one shows too few marks: depth would come from one view, ten times as poor.
+    OneView {
+        /// Marks seen, left and right.
+        seen: [u8; 2],
+    },
 }
 
 impl HoldCause {
@@ -328,6 +344,7 @@ impl HoldCause {
             HoldCause::Overruns { .. } => "H-07",
             HoldCause::Skew { .. } => "H-08",
             HoldCause::LeaseLost => "H-09",
+            HoldCause::OneView { .. } => "H-12",
         }
     }
 }
@@ -339,6 +356,11 @@ impl fmt::Display for HoldCause {
             HoldCause::FewPoints { points, needed } => write!(
                 f,
                 "only {points} marks are seen in the pictures in use, {needed} are needed: clear the view, then servo again"
+            ),
+            HoldCause::OneView { seen } => write!(
+                f,
+                "only one view shows the marks ({} left, {} right) and both are to be used: clear the view, or check whether that camera was moved; to go on with one, set views to it",
+                seen[0], seen[1]
             ),
             HoldCause::NoSolution => {
                 write!(f, "the law found no finite solution: stop, and look at rig and gripper files")
@@ -389,6 +411,10 @@ pub enum Reject {
     Settling,
     /// A number in the request is not finite or out of range.
     BadValue,
+    /// A camera was moved since the set-point was given.
+    CameraMoved,
+    /// Both views are to be used and one shows too few marks.
+    OneView,
     /// The gripper is closed on something: open it before the arm may leave.
     GripperClosed,
 }
@@ -407,6 +433,12 @@ impl Reject {
             Reject::OutOfReach => "the goal or the way to it is out of the arm's reach: move the part or the arm",
             Reject::PathLeavesView => "too few marks stay in the pictures on the way: move the arm closer or the rig",
             Reject::Settling => "wait until pictures and robot state have been good for 200 ms",
+            Reject::CameraMoved => {
+                "a camera was moved since the set-point was given: check the calibration, take new images and plan again"
+            }
+            Reject::OneView => {
+                "only one view shows the marks: clear the other, or check whether its camera was moved; or set views to the one that does"
+            }
             Reject::GripperClosed => "the gripper is closed: open it first",
             Reject::BadValue => "a value of the request is out of range",
         }
@@ -422,6 +454,7 @@ mod tests {
         let faults = [
             FaultCause::FramesStale { age_ns: 0, limit_ns: 0 },
             FaultCause::FrameStamps { count: 0 },
+            FaultCause::CameraMoved { astray_m: 0.0 },
             FaultCause::MarksJumped { jump_m: 0.0, limit_m: 0.0 },
             FaultCause::MotionMismatch { joints_m: 0.0, difference_m: 0.0 },
             FaultCause::WrongWay { agreement: 0.0, moved_m: 0.0 },

@@ -9,6 +9,8 @@ pub mod path;
 pub mod pose;
 pub mod predict;
 pub mod rates;
+pub mod rig_fit;
+pub mod rig_watch;
 pub mod screw;
 mod vision;
 mod vision_cycle;

@@ -68,6 +68,20 @@ impl PoseEstimate {
     }
 }
 
+/// Removes observations that the estimate threw out; says how many.
+pub(crate) fn keep_used(table: &mut MarkTable, e: &PoseEstimate) -> u64 {
+    let mut dropped = 0;
+    for (marks, used) in table.iter_mut().zip(&e.used) {
+        for (m, used) in marks.iter_mut().zip(used) {
+            if m.is_some() && !used {
+                *m = None;
+                dropped += 1;
+            }
+        }
+    }
+    dropped
+}
+
 #[derive(Clone, Copy)]
 struct Observation {
     view: View,

@@ -1,5 +1,6 @@
 //! What the vision thread tells the command thread about one stereo pair.
 
+use super::rig_watch::RigHealth;
 use crate::geom::{Pixel, Pose};
 use crate::gripper::MAX_MARKS;
 use nalgebra::{Matrix2, Matrix6};
@@ -45,4 +46,8 @@ pub struct Vision {
     pub covariance: Matrix6<f64>,
     /// Root mean square of the weighted reprojection error of the used marks, pixels.
     pub residual_px: f64,
+    /// What of that residual the rig's own error does not explain, pixels.
+    pub inner_residual_px: f64,
+    /// The rig as the marks show it.
+    pub rig: RigHealth,
 }

@@ -7,6 +7,8 @@ use super::content::{FreezeWatch, badly_exposed};
 use super::frame::{self, FrameFaults, FrameLimits, FrameReject, LastFrame, StereoFrame};
 use super::marks::{self, MarkSettings, Outline};
 use super::pose::{self, MarkTable, PoseEstimate, PoseSettings};
+use super::rig_fit::Evidence;
+use super::rig_watch::{RigWatch, RigWatchSettings};
 use super::{Vision, VisionStatus};
 use crate::geom::{Pose, Rig, Twist, View, exp_twist, log_pose};
 use crate::gripper::{Gripper, MAX_MARKS};
@@ -30,8 +32,11 @@ pub struct VisionSettings {
     pub jump_margin: f64,
     /// Largest standard deviation of the gripper's position along any axis, metres; above it the marks count as lost. Default 0.005.
     pub max_sigma: f64,
-    /// Largest residual of the used marks, pixels; above it this is not the gripper. Default 3.
+    /// Largest residual of the used marks that the rig's own error does not explain, pixels; above it this is not the gripper.
+    /// Default 3.
     pub max_residual_px: f64,
+    /// The rig's stated error, and when it counts as changed.
+    pub rig: RigWatchSettings,
     /// Fewest different marks that make a pose worth having: three determine one, but then nothing says that one of them is wrong.
     /// Default 4.
     pub min_marks: usize,
@@ -50,6 +55,7 @@ impl Default for VisionSettings {
             jump_margin: 0.004,
             max_sigma: 0.005,
             max_residual_px: 3.0,
+            rig: RigWatchSettings::default(),
             min_marks: 4,
             coast_frames: 5,
         }
@@ -76,6 +82,8 @@ const REMEASURE_TURN: f64 = 0.01;
 #[derive(Clone, Copy, Debug)]
 struct Track {
     pose: Pose,
+    /// Gripper in the robot's base by the encoders at `at_ns`.
+    base_from_gripper: Option<Pose>,
     /// Gripper-frame velocity, used when there is no prediction from the joints.
     velocity: Twist,
     /// Capture time of `pose`; `None` straight after a seed.
@@ -94,6 +102,16 @@ pub struct VisionCycle {
     freeze: FreezeWatch,
     faults: FrameFaults,
     health: VisionHealth,
+    watch: RigWatch,
+}
+
+/// A pose, whether it is sound, and what of its residual the rig's error does not explain.
+struct Solved {
+    estimate: PoseEstimate,
+    sound: bool,
+    inner_residual_px: f64,
+    /// What was measured, marks that the pose threw out included.
+    seen: MarkTable,
 }
 
 impl VisionCycle {
@@ -108,13 +126,15 @@ impl VisionCycle {
             freeze: FreezeWatch::new(),
             faults: FrameFaults::default(),
             health: VisionHealth::default(),
+            watch: RigWatch::new(settings.rig),
         }
     }
 
     /// Takes over an acquired pose (`left_from_gripper`); the next frame is searched about it. A pose that is not finite is ignored.
     pub fn seed(&mut self, pose: Pose) {
         if pose.translation.vector.iter().chain(pose.rotation.coords.iter()).all(|v| v.is_finite()) {
-            self.track = Some(Track { pose, velocity: Twist::zeros(), at_ns: None, misses: 0 });
+            let track = Track { pose, base_from_gripper: None, velocity: Twist::zeros(), at_ns: None, misses: 0 };
+            self.track = Some(track);
         }
     }
 
@@ -152,34 +172,46 @@ impl VisionCycle {
 
     /// Tracks one stereo pair.
     ///
-    /// `prior` is `left_from_gripper` at capture as predicted from the last pose and the joints' motion since; without it the
-    /// track's own velocity is used. It is ignored straight after a seed, and when it contradicts the last pose. A result with status
-    /// [`VisionStatus::Lost`] has no marks, a pose that means nothing, and a covariance of a million.
+    /// `base_from_gripper` is the gripper in the robot's base at capture, by the encoders; only its change from frame to frame is
+    /// used. Without it the track's own velocity predicts, and a change of the rig can be told by the marks alone. A motion that no
+    /// gripper can make is not followed. A result with status [`VisionStatus::Lost`] has no marks, a pose that means nothing, and a
+    /// covariance of a million.
     ///
     /// # Errors
     /// [`FrameReject`] when the pair, or the pose found in it, is not to be believed. The caller publishes nothing then, so that the
     /// last result ages; a *seen* loss of the marks is no error but a [`Vision`] with status [`VisionStatus::Lost`].
-    pub fn step(&mut self, frame: &StereoFrame<'_>, prior: Option<Pose>) -> Result<Vision, FrameReject> {
+    pub fn step(&mut self, frame: &StereoFrame<'_>, base_from_gripper: Option<Pose>) -> Result<Vision, FrameReject> {
         if let Err(reject) = frame::check(frame, &self.rig, &self.settings.frame, self.last_frame.as_ref()) {
             self.faults.count(&reject);
             return Err(reject);
         }
         self.accept(frame);
         let Some(track) = self.track else { return Ok(self.lost(frame)) };
-        let (start, range) = self.predict(&track, frame, prior);
+        let (start, range) = self.predict(&track, frame, base_from_gripper);
         let mut table: MarkTable = [[None; MAX_MARKS]; 2];
         self.measure(frame, &start, range, &mut table);
-        let Some(estimate) = self.solve(frame, &start, &mut table) else {
+        let Some(solved) = self.solve(frame, &start, &mut table) else {
             return Ok(self.miss(frame, track));
         };
-        if let Err(reject) = self.jump(&track, frame, &estimate) {
+        // Before anything is refused: a moved camera is what would make the rest of this look wrong.
+        let moves = self.watch.health().moves;
+        let pose = &solved.estimate.left_from_gripper;
+        self.watch.update(&self.rig, &self.gripper, &solved.seen, pose, base_from_gripper.as_ref());
+        let moved = self.watch.health().moves != moves;
+        if !solved.sound {
+            return Ok(self.miss(frame, track));
+        }
+        let estimate = solved.estimate;
+        if let Err(reject) = self.jump(&track, frame, &estimate)
+            && !moved
+        {
             self.faults.count(&reject);
             // A jump is first refused, then, if the marks stay where they cannot be, the track is given up.
             let misses = track.misses + 1;
             self.track = (misses <= 2).then_some(Track { misses, ..track });
             return Err(reject);
         }
-        Ok(self.publish(frame, &track, &estimate, table))
+        Ok(self.publish(frame, &track, &solved, table, base_from_gripper))
     }
 
     fn accept(&mut self, frame: &StereoFrame<'_>) {
@@ -199,12 +231,13 @@ impl VisionCycle {
     }
 
     /// Pose to start from, and how far about it to search (pixels).
-    fn predict(&mut self, track: &Track, frame: &StereoFrame<'_>, prior: Option<Pose>) -> (Pose, f64) {
+    fn predict(&mut self, track: &Track, frame: &StereoFrame<'_>, base_from_gripper: Option<Pose>) -> (Pose, f64) {
         let search = self.settings.marks.search_px;
         let Some(at) = track.at_ns else { return (track.pose, 1.5 * search) };
         let dt = seconds(at, stamp(frame));
         let widen = 1.0 + 0.5 * f64::from(track.misses.min(4));
-        if let Some(prior) = prior {
+        if let (Some(then), Some(now)) = (track.base_from_gripper, base_from_gripper) {
+            let prior = track.pose * (then.inverse() * now);
             if self.reachable(&track.pose, &prior, dt).is_ok() {
                 return (prior, search * widen);
             }
@@ -233,9 +266,10 @@ impl VisionCycle {
     }
 
     /// Solves, looks once more about the solution for marks that were missing or thrown out, and solves again.
-    fn solve(&mut self, frame: &StereoFrame<'_>, start: &Pose, table: &mut MarkTable) -> Option<PoseEstimate> {
+    fn solve(&mut self, frame: &StereoFrame<'_>, start: &Pose, table: &mut MarkTable) -> Option<Solved> {
+        let mut seen = *table;
         let mut best = pose::estimate(&self.rig, &self.gripper, table, start, &self.settings.pose).ok()?;
-        let dropped = keep_used(table, &best);
+        let dropped = pose::keep_used(table, &best);
         let narrow = (2.0 + 2.0 * best.residual_px).min(self.settings.marks.search_px);
         // A large disc's centre lies off its outline's middle by an amount that depends on the tilt: predicted with a tilt that was
         // wrong, all marks are measured anew.
@@ -251,13 +285,30 @@ impl VisionCycle {
         if count(table) > had {
             let again = best.left_from_gripper;
             best = pose::estimate(&self.rig, &self.gripper, table, &again, &self.settings.pose).ok()?;
-            keep_used(table, &best);
+            pose::keep_used(table, &best);
         }
         self.faults.outliers += dropped;
+        self.together(&mut seen, table);
         let worst = (0..3).map(|i| best.covariance[(i, i)]).fold(0.0, f64::max);
         let s = &self.settings;
-        let sound = best.distinct() >= s.min_marks && best.residual_px <= s.max_residual_px;
-        (sound && worst <= s.max_sigma * s.max_sigma).then_some(best)
+        let pose = &best.left_from_gripper;
+        let inner = Evidence::gather(&self.rig, &self.gripper, table, pose, s.rig.mark_px, None)
+            .and_then(|e| e.offset(&s.rig.rig_error))
+            .map_or(best.residual_px, |(_, inner)| inner);
+        let sound = best.distinct() >= s.min_marks && inner <= s.max_residual_px && worst <= s.max_sigma * s.max_sigma;
+        Some(Solved { estimate: best, sound, inner_residual_px: inner, seen })
+    }
+
+    /// What the watch is shown. Single marks that the pose threw out are wrong themselves; but where more than half of a view's marks
+    /// were thrown out it is the view that does not fit, and all that was measured there counts.
+    fn together(&self, seen: &mut MarkTable, used: &MarkTable) {
+        for (seen, used) in seen.iter_mut().zip(used) {
+            let measured = seen.iter().flatten().count();
+            let kept = seen.iter().zip(used).filter(|(s, u)| s.is_some() && u.is_some()).count();
+            if measured < 4 || 2 * kept >= measured {
+                *seen = *used;
+            }
+        }
     }
 
     /// Whether a gripper can get from `a` to `b` in `dt` seconds; else how far it is.
@@ -278,7 +329,15 @@ impl VisionCycle {
         self.reachable(&track.pose, &estimate.left_from_gripper, seconds(at, stamp(frame)))
     }
 
-    fn publish(&mut self, frame: &StereoFrame<'_>, track: &Track, e: &PoseEstimate, table: MarkTable) -> Vision {
+    fn publish(
+        &mut self,
+        frame: &StereoFrame<'_>,
+        track: &Track,
+        solved: &Solved,
+        table: MarkTable,
+        base_from_gripper: Option<Pose>,
+    ) -> Vision {
+        let e = &solved.estimate;
         let now = stamp(frame);
         let velocity = match track.at_ns {
             Some(at) if now > at => {
@@ -288,7 +347,8 @@ impl VisionCycle {
             }
             _ => Twist::zeros(),
         };
-        self.track = Some(Track { pose: e.left_from_gripper, velocity, at_ns: Some(now), misses: 0 });
+        self.track =
+            Some(Track { pose: e.left_from_gripper, base_from_gripper, velocity, at_ns: Some(now), misses: 0 });
         self.faults.in_a_row = 0;
         self.freeze.update(frame, &table);
         self.health.frozen_run = self.freeze.run();
@@ -303,6 +363,8 @@ impl VisionCycle {
             left_from_gripper: e.left_from_gripper,
             covariance: e.covariance,
             residual_px: e.residual_px,
+            inner_residual_px: solved.inner_residual_px,
+            rig: self.watch.health(),
         }
     }
 
@@ -367,6 +429,8 @@ impl VisionCycle {
             // Finite, so that arithmetic on it stays finite, and so large that nobody can mistake it for knowledge.
             covariance: Matrix6::identity() * 1e6,
             residual_px: 0.0,
+            inner_residual_px: 0.0,
+            rig: self.watch.health(),
         }
     }
 }
@@ -383,18 +447,4 @@ fn seconds(from: u64, to: u64) -> f64 {
 
 fn count(table: &MarkTable) -> usize {
     table.iter().flatten().flatten().count()
-}
-
-/// Removes observations that the estimate threw out; says how many.
-fn keep_used(table: &mut MarkTable, e: &PoseEstimate) -> u64 {
-    let mut dropped = 0;
-    for (marks, used) in table.iter_mut().zip(&e.used) {
-        for (m, used) in marks.iter_mut().zip(used) {
-            if m.is_some() && !used {
-                *m = None;
-                dropped += 1;
-            }
-        }
-    }
-    dropped
 }

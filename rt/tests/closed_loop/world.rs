@@ -8,6 +8,9 @@ use graspd_rt::cycle::{
 use graspd_rt::geom::{Camera, Distortion, Pixel, Pose, Rig, Twist, Vec3, View, exp_twist, log_pose};
 use graspd_rt::gripper::{Gripper, MAX_MARKS, Mark};
 use graspd_rt::online::interaction::PlacedView;
+use graspd_rt::online::pose::{self, MarkTable, PoseSettings};
+use graspd_rt::online::rig_fit::Evidence;
+use graspd_rt::online::rig_watch::{RigWatch, RigWatchSettings};
 use graspd_rt::online::screw::{LawSettings, MarkError, Stack};
 use graspd_rt::online::{MarkObservation, Vision, VisionStatus};
 use graspd_rt::setpoint::{Goal, SetPoint};
@@ -90,6 +93,11 @@ pub(crate) struct World {
     pub(crate) faults: Faults,
     pub(crate) slider: f64,
     pub(crate) noise_px: f64,
+    pub(crate) watch: RigWatch,
+    /// Where the gripper really has to go, in the left camera's frame as it stands at the start.
+    pub(crate) aim: Pose,
+    /// Gripper in the believed rig and in the base at the last image in which the marks were found.
+    tracked: Option<(Pose, Pose)>,
     pipeline: VecDeque<(u64, Vision)>,
     next_capture: u64,
     sequence: u64,
@@ -167,6 +175,9 @@ impl World {
             faults: Faults::default(),
             slider: 1.0,
             noise_px: 0.1,
+            aim: goal,
+            watch: RigWatch::new(RigWatchSettings::default()),
+            tracked: None,
             pipeline: VecDeque::new(),
             next_capture: 10_000 * MS,
             sequence: 0,
@@ -204,6 +215,75 @@ impl World {
         self.cycle = CommandCycle::new(self.config.clone()).unwrap();
     }
 
+    /// Moves a camera by a small motion of its own frame.
+    pub(crate) fn knock(&mut self, view: View, motion: &Twist) {
+        let motion = exp_twist(motion);
+        match view {
+            View::Left => {
+                self.base_from_left *= motion;
+                self.true_rig.right_from_left *= motion;
+            }
+            View::Right => self.true_rig.right_from_left = motion.inverse() * self.true_rig.right_from_left,
+        }
+    }
+
+    /// What the tracker makes of the marks: those near where it expects them, and the pose that it fits robustly.
+    fn track(&mut self, v: &mut Vision, truth: &Pose) {
+        let mount = self.config.gripper.flange_from_gripper;
+        let base_from_gripper = self.config.dh.base_from_gripper(&self.q, &mount);
+        let expected = self.tracked.map(|(pose, then)| pose * (then.inverse() * base_from_gripper));
+        if let Some(pose) = expected {
+            let found = |view: View, i: usize, m: &MarkObservation| {
+                let x = pose * nalgebra::Point3::from(self.config.gripper.marks[i].position);
+                let at = self.config.rig.project(view, &x.coords);
+                at.is_some_and(|p| (p - m.pixel).abs().max() < 14.0)
+            };
+            for view in View::BOTH {
+                for (i, m) in v.marks[view.index()].iter_mut().enumerate() {
+                    *m = m.filter(|m| found(view, i, m));
+                }
+            }
+        }
+        let all: MarkTable = v.marks;
+        let (rig, gripper) = (&self.config.rig, &self.config.gripper);
+        let start = expected.unwrap_or(*truth);
+        let Ok(e) = pose::estimate(rig, gripper, &all, &start, &PoseSettings::default()) else {
+            return self.lose(v);
+        };
+        for (marks, used) in v.marks.iter_mut().zip(&e.used) {
+            for (m, used) in marks.iter_mut().zip(used) {
+                *m = m.filter(|_| *used);
+            }
+        }
+        let mut shown = v.marks;
+        for (k, shown) in shown.iter_mut().enumerate() {
+            let (measured, kept) = (all[k].iter().flatten().count(), v.marks[k].iter().flatten().count());
+            if measured >= 4 && 2 * kept < measured {
+                *shown = all[k];
+            }
+        }
+        v.left_from_gripper = e.left_from_gripper;
+        v.residual_px = e.residual_px;
+        v.rig = self.watch.update(rig, gripper, &shown, &e.left_from_gripper, Some(&base_from_gripper));
+        let settings = RigWatchSettings::default();
+        v.inner_residual_px = Evidence::gather(rig, gripper, &v.marks, &e.left_from_gripper, settings.mark_px, None)
+            .and_then(|x| x.offset(&settings.rig_error))
+            .map_or(e.residual_px, |(_, inner)| inner);
+        if v.inner_residual_px > 3.0 {
+            return self.lose(v);
+        }
+        v.seen = View::BOTH.map(|view| e.used_in(view) as u8);
+        v.status = if v.seen.iter().all(|n| *n >= 4) { VisionStatus::Tracking } else { VisionStatus::Degraded };
+        self.tracked = Some((e.left_from_gripper, base_from_gripper));
+    }
+
+    fn lose(&mut self, v: &mut Vision) {
+        v.status = VisionStatus::Lost;
+        v.marks = [[None; MAX_MARKS]; 2];
+        v.seen = [0; 2];
+        v.rig = self.watch.health();
+    }
+
     /// True distance (mm) and angle (degrees) to a pose.
     pub(crate) fn error_to(&self, goal: &Pose) -> (f64, f64) {
         let p = self.left_from_gripper();
@@ -231,22 +311,26 @@ impl World {
                 seen[view.index()] += 1;
             }
         }
-        let e = Twist::from_fn(|i, _| self.rng.normal(if i < 3 { 1e-4 } else { 4e-4 }));
-        let pixels = marks.map(|view| view.map(|m: Option<MarkObservation>| m.map(|m| m.pixel)));
-        // With a rig that is believed wrongly, the pose that its pictures suggest is wrong as well.
-        let estimate =
-            if self.true_rig == self.config.rig { pose * exp_twist(&e) } else { estimate(&self.config, pose, &pixels) };
         self.sequence += 1;
-        Vision {
+        let mut v = Vision {
             sequence: self.sequence,
             capture_ns: [self.now; 2],
             status: VisionStatus::Tracking,
             marks,
             seen,
-            left_from_gripper: estimate,
+            left_from_gripper: pose,
             covariance: Matrix6::identity() * 1e-8,
             residual_px: self.noise_px,
+            inner_residual_px: self.noise_px,
+            rig: self.watch.health(),
+        };
+        let e = Twist::from_fn(|i, _| self.rng.normal(if i < 3 { 1e-4 } else { 4e-4 }));
+        self.track(&mut v, &pose);
+        // With the right rig the pose is poorer than what the marks give here: they are not all that a tracker has to cope with.
+        if self.true_rig == self.config.rig && v.status != VisionStatus::Lost {
+            v.left_from_gripper = pose * exp_twist(&e);
         }
+        v
     }
 
     fn state(&mut self, beat: i32) -> RobotState {

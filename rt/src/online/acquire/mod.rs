@@ -20,7 +20,8 @@ pub use symmetry::layout_is_ambiguous;
 use super::MarkObservation;
 use super::marks::{self, MarkSettings};
 use super::pose::{self, MarkTable, PoseEstimate, PoseSettings};
-use crate::geom::{Pose, Rig, View};
+use super::rig_fit::{self, RigFit};
+use crate::geom::{Pose, Rig, RigError, RigOffset, View};
 use crate::gripper::{Gripper, MAX_MARKS};
 use crate::image::ImageView;
 use blobs::{BlobLimits, BlobScratch};
@@ -37,14 +38,20 @@ pub struct AcquireSettings {
     pub min_contrast: f64,
     /// Radius of the smallest and largest mark looked for, pixels. Default 2.5 to 34.
     pub radius_px: [f64; 2],
-    /// Largest distance of a pair from the epipolar line, pixels. Default 4: a rig that was knocked by a tenth of a degree still works.
-    pub epipolar_px: f64,
+    /// The rig's own error: how far a pair may be from the epipolar line and marks from where a right rig had them follows from it.
+    pub rig_error: RigError,
+    /// Deviations of the epipolar distance that are let through. Default 3.5: one rig in two thousand within the stated error is not.
+    pub epipolar_sigmas: f64,
     /// Tolerance of distances between marks: metres, and share of the distance. Default 3 mm and 2 %.
     pub distance: [f64; 2],
     /// Fewest marks that must hold in each view. Default 4.
     pub min_marks: usize,
-    /// Largest residual of the final pose, pixels. Default 1.5.
+    /// Largest residual of the final pose with the rig's most probable offset taken out, pixels a degree of freedom. Default 0.75:
+    /// marks measured to half a millimetre give 0.4 at 1.5 m; a handful of other discs that happen to fit gives 1 and more.
     pub max_residual_px: f64,
+    /// How far off the rig may seem, in deviations of its stated error (root of the sum of squares). Default 5: of nine unknowns
+    /// once in three hundred rigs if the marks saw all nine; they see about five, then once in ten thousand.
+    pub max_rig_sigmas: f64,
     /// Triples of points compared at most. Default 20 million.
     pub max_triples: u64,
     /// Poses voted on at most. Default 30 000.
@@ -57,10 +64,12 @@ impl Default for AcquireSettings {
             marks: MarkSettings::default(),
             min_contrast: 20.0,
             radius_px: [2.5, 34.0],
-            epipolar_px: 4.0,
+            rig_error: RigError::default(),
+            epipolar_sigmas: 3.5,
             distance: [0.003, 0.02],
             min_marks: 4,
-            max_residual_px: 1.5,
+            max_residual_px: 0.75,
+            max_rig_sigmas: 5.0,
             max_triples: 20_000_000,
             max_votes: 30_000,
         }
@@ -105,8 +114,12 @@ pub struct Acquisition {
     pub covariance: Matrix6<f64>,
     /// Marks that hold in each view.
     pub seen: [u8; 2],
-    /// Residual of those marks, pixels.
+    /// Residual of those marks with the rig as its file has it, pixels.
     pub residual_px: f64,
+    /// The same with the rig's most probable offset taken out, a degree of freedom.
+    pub inner_residual_px: f64,
+    /// How far off the rig seems, in deviations of its stated error (root of the sum of squares over its nine unknowns).
+    pub rig_sigmas: f64,
 }
 
 /// Why the gripper was not found; each says what an operator could look at.
@@ -131,7 +144,15 @@ pub enum AcquireFailure {
     NotVerified {
         /// Marks that hold in each view under the best pose.
         seen: [u8; 2],
-        /// Their residual, pixels.
+        /// Their residual with the rig's most probable offset taken out, pixels a degree of freedom.
+        residual_px: f64,
+    },
+    /// The marks fit, but only if the rig is far more wrong than it states: a camera was moved, the calibration is another rig's, or
+    /// the gripper is one of another size.
+    RigOff {
+        /// How far off the rig seems, in deviations of its stated error.
+        sigmas: f64,
+        /// Residual with the rig as its file has it, pixels.
         residual_px: f64,
     },
     /// Two different poses explain the pictures equally well: the mark layout is symmetric, or the mark that tells is hidden.
@@ -168,7 +189,8 @@ pub fn acquire(
         return Err(AcquireFailure::TooFewBlobs { found });
     }
     let size_factor = 1.4;
-    let pair_limits = PairLimits { epipolar_px: settings.epipolar_px, size_factor };
+    let pair_limits =
+        PairLimits { rig_error: settings.rig_error, sigmas: settings.epipolar_sigmas, blob_px: BLOB_PX, size_factor };
     pairs::pair(rig, gripper, &scratch.blobs, &pair_limits, &mut scratch.points);
     if scratch.points.len() < 4 {
         return Err(AcquireFailure::TooFewPairs { found: scratch.points.len() as u16 });
@@ -190,7 +212,47 @@ pub fn acquire(
     choose(rig, gripper, images, settings, scratch, &hypotheses)
 }
 
-/// Measures every hypothesis in the pictures; the best must hold, and no other as well.
+/// A blob's centroid is off by this on its own (perspective, shading, merged rims), pixels.
+const BLOB_PX: f64 = 0.3;
+/// A measured mark is off by this on its own (its place in the gripper file, shading), pixels: 0.2 mm at 1.5 m.
+const MARK_PX: f64 = 0.15;
+
+/// Degrees of freedom that a fit takes up: six of the pose, and about five of the rig's that the marks see.
+const FITTED: f64 = 11.0;
+
+/// A pose that was measured in the images.
+#[derive(Clone, Copy)]
+struct Candidate {
+    fit: RigFit,
+    table: MarkTable,
+}
+
+impl Candidate {
+    fn estimate(&self) -> &PoseEstimate {
+        &self.fit.estimate
+    }
+
+    fn seen(&self) -> [u8; 2] {
+        View::BOTH.map(|v| self.estimate().used_in(v) as u8)
+    }
+
+    /// Residual a degree of freedom: few marks fit anything.
+    fn residual_px(&self) -> f64 {
+        let rows = 2.0 * self.support() as f64;
+        self.estimate().residual_px * crate::math::sqrt(rows / (rows - FITTED).max(1.0))
+    }
+
+    fn support(&self) -> usize {
+        self.estimate().used_in(View::Left) + self.estimate().used_in(View::Right)
+    }
+
+    fn preferred(&self, other: &Self) -> bool {
+        let (x, y) = (self.support(), other.support());
+        x > y || (x == y && self.estimate().residual_px < other.estimate().residual_px)
+    }
+}
+
+/// Measures every hypothesis in the images; the best must hold, and no other as well.
 fn choose(
     rig: &Rig,
     gripper: &Gripper,
@@ -199,73 +261,91 @@ fn choose(
     scratch: &AcquireScratch,
     hypotheses: &[Hypothesis],
 ) -> Result<Acquisition, AcquireFailure> {
-    let mut best: Option<PoseEstimate> = None;
-    let mut rival: Option<PoseEstimate> = None;
-    let mut nearly: Option<PoseEstimate> = None;
+    let mut best: Option<Candidate> = None;
+    let mut rival: Option<Candidate> = None;
+    let mut nearly: Option<Candidate> = None;
     let most = hypotheses.first().map_or(0, |h| h.matched);
     for h in hypotheses {
         // Once an answer holds, one that had half of its points cannot come near it.
         if best.is_some() && 2 * h.matched < most {
             break;
         }
-        let Some(rough) = from_blobs(rig, gripper, scratch, h) else { continue };
-        let Some(e) = measured(rig, gripper, images, settings, &rough) else { continue };
-        let holds =
-            View::BOTH.iter().all(|v| e.used_in(*v) >= settings.min_marks) && e.residual_px <= settings.max_residual_px;
+        let Some(rough) = from_blobs(rig, gripper, settings, scratch, h) else { continue };
+        let Some(c) = measured(rig, gripper, images, settings, &rough) else { continue };
+        let e = c.estimate();
+        let holds = View::BOTH.iter().all(|v| e.used_in(*v) >= settings.min_marks)
+            && c.residual_px() <= settings.max_residual_px;
         if !holds {
-            if nearly.is_none_or(|n| support(&e) > support(&n)) {
-                nearly = Some(e);
+            if nearly.is_none_or(|n| c.support() > n.support()) {
+                nearly = Some(c);
             }
             continue;
         }
         match best {
-            Some(b) if constellation::same(&b.left_from_gripper, &e.left_from_gripper) => {
-                if support(&e) > support(&b) {
-                    best = Some(e);
+            Some(b) if constellation::same(&b.estimate().left_from_gripper, &e.left_from_gripper) => {
+                if c.support() > b.support() {
+                    best = Some(c);
                 }
             }
-            Some(b) if preferred(&e, &b) => (best, rival) = (Some(e), best),
+            Some(b) if c.preferred(&b) => (best, rival) = (Some(c), best),
             Some(_) => {
-                if rival.is_none_or(|r| preferred(&e, &r)) {
-                    rival = Some(e);
+                if rival.is_none_or(|r| c.preferred(&r)) {
+                    rival = Some(c);
                 }
             }
-            None => best = Some(e),
+            None => best = Some(c),
         }
     }
-    let seen = |e: &PoseEstimate| View::BOTH.map(|v| e.used_in(v) as u8);
     let Some(best) = best else {
         return Err(match nearly {
-            Some(n) => AcquireFailure::NotVerified { seen: seen(&n), residual_px: n.residual_px },
+            Some(n) => AcquireFailure::NotVerified { seen: n.seen(), residual_px: n.residual_px() },
             None => AcquireFailure::NoConstellation,
         });
     };
     // One mark in one view more is no proof; nor is a residual that is only somewhat smaller.
     if let Some(r) = rival
-        && support(&r) + 1 >= support(&best)
-        && r.residual_px < 3.0 * best.residual_px + 0.1
+        && r.support() + 1 >= best.support()
+        && r.estimate().residual_px < 3.0 * best.estimate().residual_px + 0.1
     {
-        return Err(AcquireFailure::Ambiguous { seen: seen(&best) });
+        return Err(AcquireFailure::Ambiguous { seen: best.seen() });
+    }
+    answer(rig, gripper, settings, &best)
+}
+
+/// The pose in the rig as its file has it, which is what the tracker believes, and how far off that rig seems.
+fn answer(
+    rig: &Rig,
+    gripper: &Gripper,
+    settings: &AcquireSettings,
+    best: &Candidate,
+) -> Result<Acquisition, AcquireFailure> {
+    let mut table = best.table;
+    pose::keep_used(&mut table, best.estimate());
+    let not_verified = AcquireFailure::NotVerified { seen: best.seen(), residual_px: best.residual_px() };
+    let start = best.estimate().left_from_gripper;
+    let e = pose::estimate(rig, gripper, &table, &start, &PoseSettings::default()).map_err(|_| not_verified)?;
+    let rig_sigmas = settings.rig_error.sigmas(&best.fit.offset);
+    if rig_sigmas > settings.max_rig_sigmas {
+        return Err(AcquireFailure::RigOff { sigmas: rig_sigmas, residual_px: e.residual_px });
     }
     Ok(Acquisition {
-        left_from_gripper: best.left_from_gripper,
-        covariance: best.covariance,
-        seen: seen(&best),
-        residual_px: best.residual_px,
+        left_from_gripper: e.left_from_gripper,
+        covariance: e.covariance,
+        seen: best.seen(),
+        residual_px: e.residual_px,
+        inner_residual_px: best.residual_px(),
+        rig_sigmas,
     })
 }
 
-fn support(e: &PoseEstimate) -> usize {
-    e.used_in(View::Left) + e.used_in(View::Right)
-}
-
-fn preferred(a: &PoseEstimate, b: &PoseEstimate) -> bool {
-    let (x, y) = (support(a), support(b));
-    x > y || (x == y && a.residual_px < b.residual_px)
-}
-
-/// Pose from the blobs' centroids that a hypothesis names, a few tenths of a pixel each.
-fn from_blobs(rig: &Rig, gripper: &Gripper, scratch: &AcquireScratch, h: &Hypothesis) -> Option<Pose> {
+/// Pose and rig offset from the blobs' centroids that a hypothesis names, a few tenths of a pixel each.
+fn from_blobs(
+    rig: &Rig,
+    gripper: &Gripper,
+    settings: &AcquireSettings,
+    scratch: &AcquireScratch,
+    h: &Hypothesis,
+) -> Option<RigFit> {
     let mut table: MarkTable = [[None; MAX_MARKS]; 2];
     for (mark, point) in h.point.iter().enumerate() {
         let Some(point) = point.and_then(|p| scratch.points.get(usize::from(p))) else { continue };
@@ -273,37 +353,39 @@ fn from_blobs(rig: &Rig, gripper: &Gripper, scratch: &AcquireScratch, h: &Hypoth
             let v = view.index();
             let blob = scratch.blobs[v].get(usize::from(point.blob[v]))?;
             if let Some(slot) = table[v].get_mut(mark) {
-                *slot =
-                    Some(MarkObservation { pixel: blob.centre, covariance: Matrix2::identity() * 0.09, quality: 0.5 });
+                let covariance = Matrix2::identity() * BLOB_PX * BLOB_PX;
+                *slot = Some(MarkObservation { pixel: blob.centre, covariance, quality: 0.5 });
             }
         }
     }
-    pose::estimate(rig, gripper, &table, &h.pose, &PoseSettings::default()).ok().map(|e| e.left_from_gripper)
+    rig_fit::fit(rig, gripper, &table, &h.pose, &PoseSettings::default(), &settings.rig_error, 0.0)
 }
 
-/// Pose from sub-pixel measurements of all marks that it shows, looked for where it puts them.
+/// Pose and rig offset from sub-pixel measurements of all marks that the pose shows, looked for where both put them.
 fn measured(
     rig: &Rig,
     gripper: &Gripper,
     images: [&ImageView<'_>; 2],
     settings: &AcquireSettings,
-    start: &Pose,
-) -> Option<PoseEstimate> {
-    let mut pose = *start;
+    rough: &RigFit,
+) -> Option<Candidate> {
+    let mut pose = rough.estimate.left_from_gripper;
+    let mut offset: RigOffset = rough.offset;
     let mut result = None;
     for range in [6.0, 3.0] {
         let mut table: MarkTable = [[None; MAX_MARKS]; 2];
+        let off = rig.offset(&offset);
         for view in View::BOTH {
-            let camera_from_gripper = rig.view_from_left(view) * pose;
+            let camera_from_gripper = off.view_from_left(view) * pose;
             for (mark, slot) in gripper.marks.iter().zip(table[view.index()].iter_mut()) {
-                let outline = marks::predict(rig.camera(view), &camera_from_gripper, mark, settings.marks.min_facing);
+                let outline = marks::predict(off.camera(view), &camera_from_gripper, mark, settings.marks.min_facing);
                 *slot =
                     outline.and_then(|o| marks::measure(images[view.index()], &o, mark, &settings.marks, range).ok());
             }
         }
-        let e = pose::estimate(rig, gripper, &table, &pose, &PoseSettings::default()).ok()?;
-        pose = e.left_from_gripper;
-        result = Some(e);
+        let fit = rig_fit::fit(rig, gripper, &table, &pose, &PoseSettings::default(), &settings.rig_error, MARK_PX)?;
+        (pose, offset) = (fit.estimate.left_from_gripper, fit.offset);
+        result = Some(Candidate { fit, table });
     }
     result
 }

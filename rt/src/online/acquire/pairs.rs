@@ -1,7 +1,7 @@
 //! Which blob of the left picture may be which of the right, and where in space that would be.
 
 use super::blobs::{Blob, MAX_BLOBS};
-use crate::geom::{Normalized, Rig, Vec3, View};
+use crate::geom::{Normalized, Rig, RigError, Vec3, View};
 use crate::gripper::Gripper;
 use crate::math;
 use nalgebra::Vector3;
@@ -21,10 +21,15 @@ pub(crate) struct StereoPoint {
     pub(crate) blob: [u16; 2],
 }
 
-/// How far blobs may be from the epipolar line, pixels, and by which factor sizes may differ.
+/// How far blobs may be from the epipolar line, and by which factor sizes may differ.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PairLimits {
-    pub(crate) epipolar_px: f64,
+    /// The rig's own error, whose deviation of the epipolar distance is what the gate follows.
+    pub(crate) rig_error: RigError,
+    /// Deviations of it that are let through.
+    pub(crate) sigmas: f64,
+    /// What two blobs' centroids are off by on their own, pixels.
+    pub(crate) blob_px: f64,
     pub(crate) size_factor: f64,
 }
 
@@ -59,11 +64,6 @@ pub(crate) fn pair(
                 continue;
             }
             let (p, q) = (a * s, baseline + b * t);
-            // The gap between the rays as seen from either camera, in pixels.
-            let gap = math::sqrt((p - q).norm_squared()) * fl / s.min(t);
-            if gap > limits.epipolar_px {
-                continue;
-            }
             let (radius_l, radius_r) = (l.major * s / fl, r.major * t / fr);
             let ratio = radius_l / radius_r;
             let radius = 0.5 * (radius_l + radius_r);
@@ -74,7 +74,14 @@ pub(crate) fn pair(
             {
                 continue;
             }
-            let point = StereoPoint { position: (p + q) * 0.5, radius, dark: l.dark, blob: [i as u16, j as u16] };
+            // The gap between the rays as seen from either camera, in pixels, against what the rig's error makes of it.
+            let gap = math::sqrt((p - q).norm_squared()) * fl / s.min(t);
+            let middle = (p + q) * 0.5;
+            let sigma = limits.rig_error.epipolar_sigma_px(rig, &middle).unwrap_or(0.0);
+            if gap > limits.sigmas * math::hypot(sigma, limits.blob_px) {
+                continue;
+            }
+            let point = StereoPoint { position: middle, radius, dark: l.dark, blob: [i as u16, j as u16] };
             if out.push(point).is_err() {
                 return;
             }
