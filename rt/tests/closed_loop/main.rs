@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod heap;
+mod restart;
 mod world;
 
 use graspd_rt::arm::ArmMode;
