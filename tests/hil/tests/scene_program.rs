@@ -209,8 +209,7 @@ fn rows_of_numbers_are_taken_in_the_form_of_the_help() {
 #[test]
 fn the_document_names_every_fault() {
     let text = include_str!("../../../docs/SCENE.md");
-    let lines: Vec<&str> =
-        text.split('`').filter(|part| part.starts_with("{\"fault\":")).collect();
+    let lines: Vec<&str> = text.split('`').filter(|part| part.starts_with("{\"fault\":")).collect();
     let mut scene = Scene::start("doc", &[]);
     let unknown = scene.ask(r#"{"fault":"nothing_of_the_kind"}"#);
     let known: Vec<String> =
