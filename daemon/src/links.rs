@@ -1,9 +1,10 @@
 //! The link manager: makes the robot link on an ordinary thread, hands it to the command thread, takes dead ones back. It never arms.
 
 use crate::arm::{
-    ArmError, ArmLink, Ear, MockArm, MockLimits, Motion, RecoverTimes, UrConfig, UrLink, backoff_delay, walk_out,
+    ArmError, ArmLink, Ear, MockArm, MockLimits, Motion, RecoverTimes, UrConfig, UrLink, backoff_delay,
+    check_kinematics, check_model, read_identity, walk_out,
 };
-use crate::config::{Config, LinkKind};
+use crate::config::{Config, Kinematics, LinkKind};
 use crate::threads::{Report, Shared};
 use std::cell::RefCell;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -108,6 +109,12 @@ impl<'a> LinkManager<'a> {
             LinkKind::Rtde => {
                 self.report.link("connecting");
                 let config = self.ur_config();
+                // Every session may be with another arm: who it is comes before anything that could move it.
+                let identity = read_identity(&config)?;
+                check_model(&identity, self.config.model)?;
+                if let Kinematics::File(_, dh) = &self.config.kinematics {
+                    check_kinematics(&identity, dh)?;
+                }
                 let mut link = UrLink::connect(&config)?;
                 if let Some(state) = link.state() {
                     self.report.controller(state.robot_mode, state.safety_status_bits);

@@ -1,6 +1,6 @@
 //! From settings to threads: the one place where everything meets.
 
-use crate::config::{Config, Kinematics, LinkKind, cycle_config, load_kinematics};
+use crate::config::{Config, Kinematics, LinkKind, cycle_config};
 use crate::exit::{Exit, Failure};
 use crate::links::{LinkManager, ur_config};
 use crate::realtime::{RealtimeReport, ThreadSettings, enter, lock_memory};
@@ -9,6 +9,7 @@ use graspd_rt::arm::Dh;
 use graspd_rt::cycle::CommandCycle;
 use graspd_shm::control::{RequestServer, Verb};
 use graspd_shm::create_node;
+use serde_json::Value;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use std::path::Path;
 use std::sync::Arc;
@@ -170,7 +171,7 @@ fn kinematics(
     stop: &AtomicBool,
 ) -> Result<Option<Dh>, Failure> {
     match (&config.kinematics, config.link) {
-        (Kinematics::File(path), _) => load_kinematics(path, config.model).map(Some),
+        (Kinematics::File(_, dh), _) => Ok(Some(*dh)),
         (Kinematics::Nominal, _) | (Kinematics::Controller, LinkKind::Mock) => Ok(Some(Dh::nominal(config.model))),
         (Kinematics::Controller, LinkKind::Rtde) => loop {
             match crate::arm::read_identity(&ur_config(config)) {
@@ -188,7 +189,7 @@ fn kinematics(
                 while let Ok(Some(request)) = server.next() {
                     let accepted = matches!(request.verb, Verb::Status | Verb::Stop);
                     let reason = "the daemon waits for the controller and cannot do that yet";
-                    request.answer(accepted, &report.json(accepted, (!accepted).then_some(reason), ""));
+                    request.answer(accepted, &report.json(accepted, (!accepted).then_some(reason), "", Value::Null));
                 }
                 std::thread::sleep(Duration::from_millis(50));
             }

@@ -181,7 +181,10 @@ fn the_arm_rests_in_bound_whenever_the_daemon_is_killed_or_frozen() {
     let count = number("GRASPD_KILLS").unwrap_or(2);
     let mut random = Random(number("GRASPD_SEED").unwrap_or(20) as u64);
     let motion = std::env::var("GRASPD_MOTION").unwrap_or_else(|_| "velocity".to_owned());
-    let world = World::with(11, Extra { frame_rate: 30.0, arm: format!("motion = \"{motion}\"\n"), record: true });
+    let world = World::with(
+        11,
+        Extra { frame_rate: 30.0, arm: format!("motion = \"{motion}\"\n"), record: true, ..Extra::default() },
+    );
     let mock = world.mock();
     let scene = world.scene();
     let mut wire = Wire::open(world.folder.join("wire"));

@@ -10,6 +10,7 @@ mod error;
 mod gripper;
 mod hash;
 mod mesh;
+mod outputs;
 mod plan;
 mod pose;
 mod rig;
@@ -19,6 +20,7 @@ pub use error::FileError;
 pub use gripper::{Finger, GripperFile};
 pub use hash::ContentHash;
 pub use mesh::{Pick, PicksFile, PoseFile};
+pub use outputs::keep_apart;
 pub use plan::{
     CandidateRecord, ConeRecord, EdgeRecord, GoalRecord, GripRecord, MarkRecord, MeshRecord, ModelRecord, ObjectRecord,
     PathRecord, PickRecord, PictureRecord, PlanFile, SeenCamera, SeenRig, SelectionRecord, SourceRecord, ViewPair,

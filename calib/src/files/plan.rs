@@ -14,6 +14,30 @@ use std::path::Path;
 
 const SCHEMA: &str = "graspd-plan/1";
 
+/// Key of the hash over all other values of a plan.
+const CONTENT: &str = "content";
+
+/// The value of the key `content`, and the text with that line emptied, so that every other line keeps its number.
+fn unseal(text: &str) -> (Option<&str>, String) {
+    let mut found = None;
+    let mut top = true;
+    let lines: Vec<&str> = text
+        .split('\n')
+        .map(|line| {
+            top &= !line.trim_start().starts_with('[');
+            let value = line.trim().strip_prefix(CONTENT).and_then(|rest| rest.trim_start().strip_prefix('='));
+            match value {
+                Some(value) if top && found.is_none() => {
+                    found = Some(value.trim().trim_matches('"'));
+                    ""
+                }
+                _ => line,
+            }
+        })
+        .collect();
+    (found, lines.join("\n"))
+}
+
 /// How far a mark's recorded pixel may lie from the projection of the recorded pose: rounding, nothing else.
 const MARK_TOLERANCE_PX: f64 = 0.01;
 
@@ -418,9 +442,11 @@ impl PlanFile {
 
     /// Checks the form of a plan given as text; `name` stands for the file in errors.
     pub fn parse(text: &str, name: &str) -> Result<Self, FileError> {
+        let (content, unsealed) = unseal(text);
         let src = Source { name, text };
-        let plan: Self = src.parse()?;
+        let plan: Self = Source { name, text: &unsealed }.parse()?;
         src.schema(&plan.schema, SCHEMA)?;
+        plan.sealed(&src, content)?;
         plan.view(&src)?;
         for (key, p) in [("object.centre_m", plan.object.centre_m), ("object.normal", plan.object.normal)] {
             src.vector(key, p, 1e3, "numbers")?;
@@ -570,12 +596,31 @@ impl PlanFile {
         }
     }
 
+    /// Every value of the plan in one form, whatever its file's comments, spaces and order of keys.
+    fn canonical(&self) -> String {
+        toml::to_string(self).unwrap_or_default()
+    }
+
+    /// Refuses values that are not those that `content` was made of.
+    fn sealed(&self, src: &Source<'_>, content: Option<&str>) -> Result<(), FileError> {
+        let expected = ContentHash::of(self.canonical().as_bytes()).to_string();
+        let (found, problem) = match content {
+            Some(found) if found == expected => return Ok(()),
+            Some(found) => (found, "the plan's values are not those it was made with: it was edited after it was made"),
+            None => ("", "the hash of the plan's values is missing: it was written by hand or by an older version"),
+        };
+        let fix = "make the plan again; what should be different is an option of `graspd plan`";
+        Err(src.refuse(CONTENT, found.chars().take(16).collect::<String>(), problem, fix))
+    }
+
     /// The file's text; the same plan gives the same bytes.
     pub fn to_toml(&self) -> String {
-        let body = toml::to_string(self).unwrap_or_default();
+        let body = self.canonical();
+        let content = ContentHash::of(body.as_bytes());
         format!(
             "# A plan: where the gripper's marks have to be in both pictures, and how that was found.\n\
-             # Lengths in metres in the left camera's frame unless a key says otherwise; every key is described in docs/FILES.md.\n{body}"
+             # Lengths in metres in the left camera's frame unless a key says otherwise; every key is described in docs/FILES.md.\n\
+             {CONTENT} = \"{content}\"\n{body}"
         )
     }
 

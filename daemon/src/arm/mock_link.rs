@@ -114,7 +114,9 @@ impl MockArm {
             runtime_state: if running { 2 } else { 1 },
             speed_scaling: 1.0,
             target_speed_fraction: 1.0,
-            digital_outputs: self.outputs,
+            // The tool's outputs stand where a controller has them, behind the configurable ones.
+            digital_outputs: self.outputs & 0xff | (self.outputs & 0x300) << 8,
+            tool: None,
             echo: self.last_beat,
             script_state: self.script.0,
             script_fault: self.script.1,

@@ -19,7 +19,9 @@ pub use dashboard::Dashboard;
 pub use link::{ArmLink, LinkFault, LinkPoll, LinkStats};
 pub use messages::{Ear, Said, SaidKind, parse_message, robot_mode, safety_mode, safety_words};
 pub use mock_link::{MockArm, MockLimits};
-pub use primary::{Identity, SubPackages, check_model, parse_identity, read_identity};
+pub use primary::{
+    Identity, SAME_ARM, SubPackages, check_kinematics, check_model, flanges_apart, parse_identity, read_identity,
+};
 pub use recover::{RecoverStep, RecoverTimes, recover, walk_out};
 pub use script::{render, start_script, stop_script};
 pub use ur::UrLink;

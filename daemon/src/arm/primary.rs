@@ -19,7 +19,7 @@ const CONFIGURATION: u8 = 6;
 /// Larger packages than this are not sent by any controller.
 const MAX_PACKAGE: usize = 1 << 16;
 /// An arm as built is this close to its model's table at the flange, m. Models differ by more.
-const SAME_ARM: f64 = 0.03;
+pub const SAME_ARM: f64 = 0.03;
 
 /// What the controller says about the arm.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -145,16 +145,32 @@ pub fn check_model(identity: &Identity, model: Model) -> Result<(), ArmError> {
     if identity.robot_type != number {
         return Err(wrong(format!("robot type {} ({family} is {number})", identity.robot_type)));
     }
-    let nominal = Dh::nominal(model);
-    for q in [[0.0; 6], [0.5, -1.2, 1.0, -0.7, 1.3, 0.2], [-1.0, -0.4, -1.5, 0.9, -1.1, 2.0]] {
-        let flange = |dh: &Dh| dh.base_from_flange(&q).translation.vector;
-        let apart = (flange(&nominal) - flange(&identity.dh)).norm();
-        // Written so that NaN is refused.
-        if !(apart < SAME_ARM) {
-            return Err(wrong(format!("kinematics {:.0} mm away from that model's", apart * 1e3)));
-        }
+    let apart = flanges_apart(&Dh::nominal(model), &identity.dh);
+    // Written so that NaN is refused.
+    if !(apart < SAME_ARM) {
+        return Err(wrong(format!("kinematics {:.0} mm away from that model's", apart * 1e3)));
     }
     Ok(())
+}
+
+/// Refuses kinematics that are not those of the arm at hand: what the controller says of itself is the measure.
+pub fn check_kinematics(identity: &Identity, dh: &Dh) -> Result<(), ArmError> {
+    let apart = flanges_apart(&identity.dh, dh);
+    if !(apart < SAME_ARM) {
+        return Err(ArmError::OtherKinematics { apart_mm: apart * 1e3 });
+    }
+    Ok(())
+}
+
+/// How far apart two tables put the flange, at worst, m. Calibrated tables differ in single numbers by metres (parallel axes) and in
+/// the flange by millimetres, so that only the flange tells.
+pub fn flanges_apart(a: &Dh, b: &Dh) -> f64 {
+    let places = [[0.0; 6], [0.5, -1.2, 1.0, -0.7, 1.3, 0.2], [-1.0, -0.4, -1.5, 0.9, -1.1, 2.0]];
+    places.iter().fold(0.0, |worst: f64, q| {
+        let flange = |dh: &Dh| dh.base_from_flange(q).translation.vector;
+        let apart = (flange(a) - flange(b)).norm();
+        if apart.is_nan() { f64::INFINITY } else { worst.max(apart) }
+    })
 }
 
 #[cfg(test)]

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use graspd_rt::arm::{ArmCommand, ArmMode, Joints, RobotState};
 use graspd_rt::rtde::{
-    COMMAND_FIELDS, ClockStep, CommandWriter, ControllerVersion, Event, Framer, GapMeter, MAX_PACKAGE, Phase,
-    SCRIPT_VERSION, STATE_FIELDS, Session, StateReader, Version, script_state,
+    COMMAND_FIELDS, ClientError, ClockStep, CommandWriter, ControllerVersion, Event, Framer, GapMeter, MAX_PACKAGE,
+    NEEDED_FIELDS, Phase, SCRIPT_VERSION, STATE_FIELDS, Session, StateReader, Version, script_state,
 };
 
 use super::link::{ArmLink, LinkFault, LinkPoll, LinkStats};
@@ -60,8 +60,20 @@ impl UrLink {
     /// # Errors
     /// No connection, an answer that refuses a field (by name), or silence.
     pub fn connect(config: &UrConfig) -> Result<UrLink, ArmError> {
+        match Self::connect_with(config, &STATE_FIELDS) {
+            // The controller's software is from before it told its tool point: the loop does without.
+            Err(ArmError::Session(ClientError::NotFound(field)))
+                if STATE_FIELDS[NEEDED_FIELDS..].contains(&field.to_string().as_str()) =>
+            {
+                Self::connect_with(config, &STATE_FIELDS[..NEEDED_FIELDS])
+            }
+            done => done,
+        }
+    }
+
+    fn connect_with(config: &UrConfig, fields: &[&str]) -> Result<UrLink, ArmError> {
         let stream = config.open(Port::Rtde)?;
-        let session = Session::new(&STATE_FIELDS, &[&COMMAND_FIELDS], config.frequency_hz)?;
+        let session = Session::new(fields, &[&COMMAND_FIELDS], config.frequency_hz)?;
         let unknown = graspd_rt::rtde::ClientError::NoRecipeId;
         let reader = StateReader::new(session.outputs()).ok_or(unknown)?;
         let token = fresh_token();

@@ -176,6 +176,15 @@ pub enum ArmError {
         /// From the controller.
         found: String,
     },
+    /// The kinematics given are not this arm's.
+    #[error(
+        "arm.kinematics puts the flange {apart_mm:.0} mm away from where the controller says it is: name this arm's own file, or \
+         use \"controller\""
+    )]
+    OtherKinematics {
+        /// How far apart, mm.
+        apart_mm: f64,
+    },
     /// A dashboard command was refused.
     #[error("dashboard answers `{command}` with \"{answer}\": {fix}")]
     Dashboard {

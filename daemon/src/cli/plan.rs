@@ -2,15 +2,18 @@
 
 use super::args::PlanArgs;
 use crate::exit::{Exit, Failure};
+use graspd_calib::files::keep_apart;
 use graspd_calib::mesh_cli::parse_pose;
 use graspd_calib::plan_cli::{Class, Outcome, Request, run};
 use std::io::Write as _;
+use std::path::Path;
 
 /// Runs it.
 ///
 /// # Errors
 /// Usage (2), a file or selection that is wrong (3), a rim or grasp that the tests refuse (1). Nothing is written then.
 pub fn plan(args: &PlanArgs) -> Result<Exit, Failure> {
+    keep_inputs(args).map_err(|message| Failure { exit: Exit::Usage, message })?;
     if args.part.mesh.is_some() {
         return finish(args, super::mesh::plan(args));
     }
@@ -49,6 +52,27 @@ pub fn plan(args: &PlanArgs) -> Result<Exit, Failure> {
         report: args.report.clone(),
     });
     finish(args, outcome)
+}
+
+/// No output over an input: a rig that was overwritten by its own plan is lost.
+fn keep_inputs(args: &PlanArgs) -> Result<(), String> {
+    let part = &args.part;
+    // These two are a file or six numbers; numbers are no file's name that anything here would write.
+    let (present, base) = (args.present.as_deref().map(Path::new), part.base.as_deref().map(Path::new));
+    keep_apart(
+        &[("--out", args.out.as_deref()), ("--overlay", args.overlay.as_deref()), ("--report", args.report.as_deref())],
+        &[
+            ("--left", args.left.as_deref()),
+            ("--right", args.right.as_deref()),
+            ("--rig", Some(&args.rig)),
+            ("--gripper", Some(&args.gripper)),
+            ("--present", present),
+            ("--mesh", part.mesh.as_deref()),
+            ("--mesh-pose", part.mesh_pose.as_deref()),
+            ("--points", part.points.as_deref()),
+            ("--base", base),
+        ],
+    )
 }
 
 /// Prints what came out; the class says with which code the program ends.

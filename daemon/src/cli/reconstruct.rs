@@ -9,6 +9,8 @@ use crate::exit::{Exit, Failure};
 /// A file that cannot be read, parsed or written. A case that is refused is no error: its result says so.
 pub fn reconstruct(args: &ReconstructArgs) -> Result<Exit, Failure> {
     let (from, to) = (args.cases.display(), args.out.display());
+    graspd_calib::files::keep_apart(&[("--out", Some(&args.out))], &[("CASES.json", Some(&args.cases))])
+        .map_err(|message| Failure { exit: Exit::Usage, message })?;
     let text = std::fs::read_to_string(&args.cases)
         .map_err(|e| Failure::input(format!("{from}: cannot be read ({e}); name a file of cases (docs/FILES.md)")))?;
     let results = graspd_calib::golden::reconstruct_file(&text).map_err(|e| Failure::input(format!("{from}: {e}")))?;

@@ -1,7 +1,7 @@
 //! `graspd run` and `graspd check`.
 
 use super::args::RunArgs;
-use crate::config::Config;
+use crate::config::{Config, Kinematics};
 use crate::exit::{Exit, Failure};
 use crate::wiring;
 
@@ -25,5 +25,20 @@ pub fn check(args: &RunArgs) -> Result<Exit, Failure> {
     println!("  rig       {} ({}x{})", config.rig.hash(), config.rig.rig.left.width, config.rig.rig.left.height);
     println!("  gripper   {} ({} marks)", config.gripper.hash(), config.gripper.gripper.marks.len());
     println!("  arm       {} at {}", config.raw.arm.model, config.raw.arm.address);
+    println!(
+        "  dh table  {}",
+        match &config.kinematics {
+            Kinematics::Controller => "the controller's own".to_owned(),
+            Kinematics::Nominal => format!("nominal {}", config.raw.arm.model),
+            Kinematics::File(path, _) => path.display().to_string(),
+        }
+    );
+    let s = config.stop;
+    println!(
+        "  stop      from full speed: {:.0} ms, {:.1} degrees a joint, {:.1} mm of the gripper; the arm's own reaction comes before it",
+        s.time_s * 1e3,
+        s.joint_rad.to_degrees(),
+        s.tcp_m * 1e3
+    );
     Ok(Exit::Done)
 }

@@ -9,6 +9,7 @@
 //! ```
 
 mod acquire;
+mod advice;
 mod command;
 mod refusal;
 mod report;

@@ -2,7 +2,7 @@
 
 use crate::arm::{Said, SaidKind, robot_mode, safety_words};
 use crossbeam::queue::ArrayQueue;
-use graspd_rt::cycle::{CycleRecord, Transition, Why};
+use graspd_rt::cycle::{CycleRecord, Grip, Transition, Why};
 use graspd_rt::mode::{FaultCause, ModeName};
 use graspd_rt::setpoint::SetPoint;
 use graspd_shm::control::{Percentiles, TelemetrySample};
@@ -23,6 +23,9 @@ struct State {
     lasting: Option<FaultCause>,
     sample: TelemetrySample,
     rest: bool,
+    grip: Grip,
+    /// Age of the newest usable image, ns; `u64::MAX` before the first.
+    image_age_ns: u64,
     /// Robot mode and safety bits when the link last looked, for the time without telemetry.
     controller: Option<(i32, u32)>,
     /// What the controller has said, the newest last.
@@ -102,11 +105,20 @@ impl Report {
         s.mode = Some(record.mode);
         s.rest = record.command.rates.iter().all(|r| *r == 0.0);
         s.lasting = record.lasting;
+        (s.grip, s.image_age_ns) = (record.grip, record.vision_age_ns);
     }
 
     /// What is wrong with the robot now (in a fault: what still would be after a reset), in words with its code.
     pub fn lasting(&self) -> Option<String> {
         self.lock().lasting.map(|cause| format!("{}: {cause}", cause.code()))
+    }
+
+    /// Why images are refused (empty where they are not), and the age of the newest usable one, ms.
+    pub fn images(&self) -> (String, Option<f64>) {
+        let s = self.lock();
+        // 0 is what nobody has noted yet.
+        let age = Some(s.image_age_ns).filter(|ns| *ns != u64::MAX && s.mode.is_some());
+        (s.refusal.clone(), age.map(|ns| ns as f64 * 1e-6))
     }
 
     /// Notes the newest telemetry.
@@ -203,7 +215,11 @@ impl Report {
 
     /// Notes an accepted set-point.
     pub fn setpoint(&self, setpoint: &SetPoint, name: String) {
-        self.lock().plan = name;
+        let mut s = self.lock();
+        s.plan = name;
+        // Telemetry says the same a moment later; the answer to whoever sent it must not say "none" until then.
+        s.sample.setpoint = setpoint.id;
+        drop(s);
         let _ = self.setpoints.force_push(*setpoint);
     }
 
@@ -222,8 +238,9 @@ impl Report {
         self.lock().rest
     }
 
-    /// The whole state as one JSON object.
-    pub fn json(&self, accepted: bool, reason: Option<&str>, marks: &str) -> String {
+    /// The whole state as one JSON object, with what else the caller knows.
+    pub fn json(&self, accepted: bool, reason: Option<&str>, marks: &str, more: Value) -> String {
+        let (_, image_age_ms) = self.images();
         let s = self.lock();
         let t = &s.sample;
         let mut v = json!({
@@ -239,6 +256,8 @@ impl Report {
             "marks": if marks.is_empty() { format!("{} left, {} right of {}", t.marks_seen[0], t.marks_seen[1], t.mark_count) } else { marks.to_owned() },
             "setpoint": if t.setpoint == 0 { String::from("none") } else { format!("{:016x}", t.setpoint) },
             "plan": s.plan,
+            "gripper": s.grip.as_str(),
+            "image_age_ms": image_age_ms,
             "robot_mode": t.robot_mode,
             "ticks": t.ticks,
             "overruns": t.overruns,
@@ -259,6 +278,9 @@ impl Report {
         if let (Some(reason), Some(map)) = (reason, v.as_object_mut()) {
             map.insert("reason".into(), json!(reason));
         }
+        if let (Value::Object(more), Some(map)) = (more, v.as_object_mut()) {
+            map.extend(more);
+        }
         v.to_string()
     }
 }
@@ -268,7 +290,7 @@ mod tests {
     use super::*;
 
     fn status(report: &Report) -> Value {
-        serde_json::from_str(&report.json(true, None, "")).unwrap()
+        serde_json::from_str(&report.json(true, None, "", Value::Null)).unwrap()
     }
 
     #[test]

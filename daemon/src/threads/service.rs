@@ -1,21 +1,27 @@
 //! The service thread (the process's main thread): verbs, signals, supervision. It asks the command thread and never commands.
 
 use super::acquire::AcquireReport;
+use super::advice;
 use super::report::Report;
 use super::shared::Shared;
 use crate::config::Config;
 use crate::realtime::now_ns;
 use graspd_calib::files::PlanFile;
 use graspd_rt::cycle::{Request as CycleRequest, RequestKind};
-use graspd_rt::mode::ModeName;
+use graspd_rt::mode::{ModeName, Reject};
 use graspd_rt::setpoint::SetPoint;
 use graspd_shm::control::{Request, RequestServer, Verb};
+use serde_json::{Value, json};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 /// Requests that start or allow motion are refused when older than this: a late message is not an operator's will any more.
 const MAX_AGE_NS: u64 = 250_000_000;
+/// One monotonic clock serves the whole host: a stamp later than this after now was not taken from it, and would never grow old.
+const MAX_AHEAD_NS: u64 = 1_000_000;
+/// Images older than this are part of the answer to why the arm cannot be armed.
+const OLD_IMAGE_MS: f64 = 100.0;
 /// How long the command thread may take to answer: many beats.
 const ANSWER_WITHIN: Duration = Duration::from_millis(500);
 
@@ -39,36 +45,58 @@ pub struct Service<'a> {
 impl Service<'_> {
     /// Answers one request.
     pub fn answer(&self, request: &Request, id: u64) {
-        let stale = now_ns().saturating_sub(request.stamp_ns) > MAX_AGE_NS;
-        let result = match request.verb {
-            Verb::Status => Ok(()),
-            Verb::Stop => {
+        let result = match (request.verb, out_of_time(request.stamp_ns, now_ns())) {
+            (Verb::Status, _) => Ok(()),
+            (Verb::Stop, _) => {
                 self.shared.stop_latch.store(true, Ordering::Release);
                 Ok(())
             }
-            Verb::Arm | Verb::Servo | Verb::Setpoint | Verb::Gripper if stale => {
-                Err("the request is older than 250 ms and is not carried out; send it again".to_owned())
-            }
-            Verb::Arm => self.ask(id, RequestKind::Arm).map_err(|e| self.with_cause(e)),
-            Verb::Servo => self.ask(id, RequestKind::Servo).map_err(|e| self.with_cause(e)),
-            Verb::Reset => self.ask(id, RequestKind::Reset).map_err(|e| self.with_cause(e)),
-            Verb::Setpoint => self.setpoint(&request.payload),
-            Verb::Recover => self.recover(),
-            Verb::Gripper => self.gripper(&request.payload, id),
+            (Verb::Reset, _) => self.ask(id, RequestKind::Reset),
+            (_, Some(why)) => Err(why),
+            (Verb::Arm, _) => self.ask(id, RequestKind::Arm),
+            (Verb::Servo, _) => self.ask(id, RequestKind::Servo),
+            (Verb::Setpoint, _) => self.setpoint(&request.payload),
+            (Verb::Recover, _) => self.recover(id),
+            (Verb::Gripper, _) => self.gripper(&request.payload, id),
         };
         if request.verb == Verb::Stop {
             self.wait_for_the_ramp();
         }
         let reason = result.as_ref().err().map(String::as_str);
-        request.answer(result.is_ok(), &self.report.json(result.is_ok(), reason, &self.marks.text()));
+        let json = self.report.json(result.is_ok(), reason, &self.marks.text(), self.configured());
+        request.answer(result.is_ok(), &json);
     }
 
-    /// A refusal, and what is wrong with the robot if anything is.
-    fn with_cause(&self, refusal: String) -> String {
-        match self.report.lasting() {
-            Some(cause) => format!("{refusal} ({cause})"),
-            None => refusal,
+    /// What the configuration promises, and whether its files still say so.
+    fn configured(&self) -> Value {
+        let s = self.config.stop;
+        let changed: Vec<String> =
+            self.config.files.iter().filter(|f| f.changed()).map(|f| f.path.display().to_string()).collect();
+        json!({
+            "stop_from_full_speed": {
+                "time_ms": s.time_s * 1e3, "joint_deg": s.joint_rad.to_degrees(), "tcp_mm": s.tcp_m * 1e3,
+            },
+            "configuration_changed": changed,
+        })
+    }
+
+    /// A refusal in words; where the robot or the pictures are what is missing, with all that the status knows of them.
+    fn refused(&self, kind: RequestKind, reject: Reject) -> String {
+        let words = advice::refusal(kind, self.report.mode().unwrap_or(ModeName::Idle), reject);
+        let mut causes: Vec<String> = self.report.lasting().into_iter().collect();
+        if matches!(reject, Reject::NoMarks | Reject::Settling | Reject::WrongMode) {
+            let (refusal, age_ms) = self.report.images();
+            if !refusal.is_empty() {
+                causes.push(format!("images are refused: {refusal}"));
+            }
+            match age_ms {
+                None => causes.push("no usable image has come yet".to_owned()),
+                Some(ms) if ms > OLD_IMAGE_MS => causes.push(format!("the newest usable image is {ms:.0} ms old")),
+                Some(_) => {}
+            }
+            causes.extend(Some(self.marks.text()).filter(|t| !t.is_empty()));
         }
+        if causes.is_empty() { words } else { format!("{words} ({})", causes.join("; ")) }
     }
 
     /// A stop is answered when its ramp has begun.
@@ -90,7 +118,7 @@ impl Service<'_> {
             if let Some(reply) = self.shared.replies.pop()
                 && reply.id == id
             {
-                return reply.result.map_err(|r| r.reason().to_owned());
+                return reply.result.map_err(|r| self.refused(kind, r));
             }
             std::thread::sleep(Duration::from_millis(1));
         }
@@ -138,9 +166,14 @@ impl Service<'_> {
         self.ask(id, RequestKind::Gripper { close })
     }
 
-    fn recover(&self) -> Result<(), String> {
-        if matches!(self.report.mode(), Some(ModeName::Servoing | ModeName::Converged | ModeName::Stopping)) {
-            return Err("the arm is moving; stop first".to_owned());
+    fn recover(&self, id: u64) -> Result<(), String> {
+        match self.report.mode() {
+            Some(ModeName::Servoing | ModeName::Converged | ModeName::Stopping) => {
+                return Err("the arm is moving; stop first".to_owned());
+            }
+            // A recovery ends the session, which is a fault to whoever is armed; what is asked for is an idle arm.
+            Some(ModeName::Armed) => self.ask(id, RequestKind::Disarm)?,
+            _ => {}
         }
         self.recover.store(true, Ordering::Release);
         Ok(())
@@ -182,6 +215,41 @@ impl Service<'_> {
         std::thread::sleep(Duration::from_millis(30));
         while Instant::now() < until && !self.report.at_rest() {
             std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+}
+
+/// Why a request's stamp does not allow it to be carried out; `None` where it does.
+fn out_of_time(stamp_ns: u64, now_ns: u64) -> Option<String> {
+    if now_ns.saturating_sub(stamp_ns) > MAX_AGE_NS {
+        return Some("the request is older than 250 ms and is not carried out; send it again".to_owned());
+    }
+    let ahead = stamp_ns.saturating_sub(now_ns);
+    (ahead > MAX_AHEAD_NS).then(|| {
+        format!(
+            "the request is stamped {:.1} ms in the future and is not carried out; stamp it by CLOCK_MONOTONIC of this host",
+            ahead as f64 * 1e-6
+        )
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stamps_are_believed_within_their_bounds_only() {
+        let now = 10_000_000_000;
+        for (stamp, fine) in [
+            (now, true),
+            (now - MAX_AGE_NS, true),
+            (now - MAX_AGE_NS - 1, false),
+            (now + MAX_AHEAD_NS, true),
+            (now + MAX_AHEAD_NS + 1, false),
+            (u64::MAX, false),
+            (0, false),
+        ] {
+            assert_eq!(out_of_time(stamp, now).is_none(), fine, "{stamp}");
         }
     }
 }

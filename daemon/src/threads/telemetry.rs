@@ -205,10 +205,10 @@ fn fill(sample: &mut TelemetrySample, beat: &BeatRecord, setpoint: Option<&SetPo
     sample.qd = r.qd;
     sample.command = r.command.rates;
     sample.screw = r.screw.into();
-    let p = &r.left_from_gripper;
-    let q = p.rotation.quaternion();
-    let t = p.translation.vector;
-    sample.left_from_gripper = [t.x, t.y, t.z, q.w, q.i, q.j, q.k];
+    sample.left_from_gripper = r.left_from_gripper.map_or([f64::NAN; 7], |p| {
+        let (t, q) = (p.translation.vector, p.rotation.quaternion());
+        [t.x, t.y, t.z, q.w, q.i, q.j, q.k]
+    });
     sample.error_px = r.error_px;
     sample.residual_px = r.residual_px;
     sample.condition = r.mark_condition;
@@ -217,12 +217,12 @@ fn fill(sample: &mut TelemetrySample, beat: &BeatRecord, setpoint: Option<&SetPo
         Stage::Pregrasp | Stage::Retreat => &s.pregrasp,
         Stage::Grasp | Stage::Turn => &s.grasp,
     });
-    (sample.distance_m, sample.angle_rad) = match goal {
-        Some(g) => {
+    (sample.distance_m, sample.angle_rad) = match (goal, r.left_from_gripper) {
+        (Some(g), Some(p)) => {
             let d = p.inverse() * g.left_from_gripper;
             (d.translation.vector.norm(), d.rotation.angle())
         }
-        None => (f64::NAN, f64::NAN),
+        _ => (f64::NAN, f64::NAN),
     };
     goals(sample, goal);
 }

@@ -69,13 +69,15 @@ pub(crate) struct Extra {
     pub(crate) frame_rate: f64,
     /// Lines added to `[arm]`, with their ends.
     pub(crate) arm: String,
+    /// Tables added to the configuration, with their ends.
+    pub(crate) tables: String,
     /// Whether the mock writes its wire record to `wire`.
     pub(crate) record: bool,
 }
 
 impl Default for Extra {
     fn default() -> Self {
-        Self { frame_rate: 60.0, arm: String::new(), record: false }
+        Self { frame_rate: 60.0, arm: String::new(), tables: String::new(), record: false }
     }
 }
 
@@ -121,8 +123,8 @@ impl World {
         let config = format!(
             "cell = \"kill\"\n[files]\nrig = \"world/rig.toml\"\ngripper = \"world/gripper.toml\"\n[shm]\nroot = \"shm\"\n\
              [arm]\nmodel = \"ur5e\"\naddress = \"{address}\"\nkinematics = \"world/arm.toml\"\n{}[loop]\nbest_effort = true\n\
-             [vision]\nframe_rate_hz = {:.1}\n",
-            extra.arm, extra.frame_rate
+             [vision]\nframe_rate_hz = {:.1}\n{}",
+            extra.arm, extra.frame_rate, extra.tables
         );
         std::fs::write(folder.join("graspd.toml"), config).unwrap();
         Self { folder, address, joints, extra }

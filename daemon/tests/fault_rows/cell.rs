@@ -167,6 +167,14 @@ impl Cell {
         }
     }
 
+    /// The loop is told an arm whose lengths are this many times the true ones.
+    pub(crate) fn mistake_lengths(&mut self, times: f64) {
+        let mut config = self.config.clone();
+        config.dh.a = config.dh.a.map(|v| v * times);
+        config.dh.d = config.dh.d.map(|v| v * times);
+        self.cycle = CommandCycle::new(config).unwrap();
+    }
+
     /// An order of the control port.
     pub(crate) fn order(&mut self, command: Command) {
         self.server.world.command(command, self.now).unwrap();

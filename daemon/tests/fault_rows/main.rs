@@ -371,3 +371,30 @@ fn a_link_that_ends_says_why() {
         assert!(fault.to_string().contains(part), "{fault}");
     }
 }
+
+/// Kinematics that are not the arm's make the gripper's speed cap another than its figure: the controller's own word on its tool
+/// point says so, wherever that point is. A controller that does not say it is driven all the same.
+#[test]
+fn kinematics_that_are_not_the_arms_are_noticed_by_the_controllers_own_speed() {
+    let tool = Command::Tcp { pose: [0.02, -0.03, 0.17, 0.1, 0.2, -0.3] };
+    for (times, noticed) in [(0.8, true), (1.25, true), (1.0, false)] {
+        let mut cell = Cell::start(&[tool.clone()], |_| {}).unwrap();
+        cell.mistake_lengths(times);
+        cell.run(600);
+        assert_eq!(cell.ask_servo(), Ok(()), "{times}");
+        let from = cell.now;
+        while cell.cycle.mode().drives()
+            && cell.cycle.mode().name() != ModeName::Converged
+            && cell.now < from + 30_000 * MS
+        {
+            cell.beat(None, false);
+        }
+        let code = cell.cycle.mode().fault().map(|f| (f.cause.code(), f.cause.to_string()));
+        println!("B17 lengths x {times:<14} {code:?} after {} ms", (cell.now - from) / MS);
+        assert_eq!(code.map(|c| c.0), noticed.then_some("F-ARM-17"), "{times}");
+    }
+    let mut cell = Cell::start(&[Command::NotFound { names: vec!["tcp_offset".to_owned()] }], |_| {}).unwrap();
+    assert!(cell.link.as_ref().unwrap().state().unwrap().tool.is_none());
+    cell.move_off();
+    arrives(&mut cell, "B17 tool point not told", &row("B17", "not told", Command::Ping, Arrives));
+}

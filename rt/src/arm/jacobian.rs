@@ -1,10 +1,16 @@
 //! Body Jacobian: joint rates to the gripper's velocity screw.
 
-use super::{Dh, Joints};
+use super::{Dh, Joints, pose_from_ur};
 use crate::geom::{Pose, Vec3};
 use nalgebra::{Matrix6, Vector6};
 
 impl Dh {
+    /// Speed (m/s) of the point at `offset` in the flange's frame (m and rotation vector, as UR writes it) at joint rates `qd`.
+    pub fn tool_speed(&self, q: &Joints, qd: &Joints, offset: &[f64; 6]) -> f64 {
+        let xi = self.body_jacobian(q, &pose_from_ur(offset)) * Vector6::from_column_slice(qd);
+        crate::math::sqrt(xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2])
+    }
+
     /// Body Jacobian at the gripper: `xi = J(q) qd`, where `xi = [v; w]` (m/s, rad/s) is the screw of the gripper relative to the
     /// base, of the point at the gripper's origin, expressed in the gripper frame.
     ///

@@ -9,4 +9,4 @@ mod state;
 pub use inverse::{InverseError, angle_between, closed_form, inverse, newton};
 pub use kinematics::{Dh, pose_from_ur, pose_to_ur, rotation_vector};
 pub use models::{JointRange, Model, READY};
-pub use state::{ArmCommand, ArmMode, Joints, RobotState};
+pub use state::{ArmCommand, ArmMode, Joints, RobotState, ToolPoint};

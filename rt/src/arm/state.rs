@@ -3,6 +3,15 @@
 /// Joint values, base to wrist 3.
 pub type Joints = [f64; 6];
 
+/// The controller's own word on the point that it calls its TCP.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ToolPoint {
+    /// `tcp_offset`: the point in the flange's frame, m and rotation vector.
+    pub offset: [f64; 6],
+    /// `actual_TCP_speed`: its velocity in the base's frame, m/s and rad/s.
+    pub speed: [f64; 6],
+}
+
 /// Robot state of one controller step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RobotState {
@@ -32,6 +41,8 @@ pub struct RobotState {
     pub target_speed_fraction: f64,
     /// `actual_digital_output_bits`.
     pub digital_outputs: u64,
+    /// What the controller says of its own tool point; `None` where its software does not.
+    pub tool: Option<ToolPoint>,
     /// Beat counter echoed by the control script.
     pub echo: i32,
     /// State word of the control script (see `dist/graspd_control.script`).
@@ -40,6 +51,14 @@ pub struct RobotState {
     pub script_fault: i32,
     /// Session token echoed by the control script: tells our script's instance from any other.
     pub script_token: i32,
+}
+
+impl RobotState {
+    /// The outputs as the control script numbers them: 0 to 7 the controller's, 8 and 9 the tool's.
+    pub fn output_levels(&self) -> u32 {
+        // On the wire the configurable outputs lie between the two.
+        (self.digital_outputs & 0xff) as u32 | (self.digital_outputs >> 16 & 0b11) as u32 * 0x100
+    }
 }
 
 /// What the control script is asked to do in this step.

@@ -1,5 +1,6 @@
 //! What goes into a beat of the command cycle and what comes out of it.
 
+use super::grip::Grip;
 use crate::arm::{ArmCommand, Joints, RobotState};
 use crate::geom::{Pose, Twist};
 use crate::guard::Held;
@@ -171,13 +172,15 @@ pub struct CycleRecord {
     pub q: Joints,
     /// Measured joint velocities, rad/s.
     pub qd: Joints,
-    /// Gripper in the rig now, predicted.
-    pub left_from_gripper: Pose,
+    /// Gripper in the rig now, predicted; `None` before the marks were seen.
+    pub left_from_gripper: Option<Pose>,
+    /// The gripper by its outputs.
+    pub grip: Grip,
     /// The reference, in the rig.
     pub reference: Pose,
-    /// Mark error against the reference, pixels rms.
+    /// Mark error against the reference, pixels rms; NaN while the law does not drive.
     pub error_px: f64,
-    /// What no motion can remove of it, pixels: at rest the rig's health figure.
+    /// What no motion can remove of it, pixels: at rest the rig's health figure; NaN while the law does not drive.
     pub residual_px: f64,
     /// Motion that would bring the marks onto the reference, gripper frame.
     pub correction: Twist,
@@ -191,7 +194,7 @@ pub struct CycleRecord {
     pub held: Held,
     /// Speed share in force (age of data, marks, singularity, guard), 0 to 1.
     pub scale: f64,
-    /// Smallest singular value of the mark stack, px/m.
+    /// Smallest singular value of the mark stack, px/m; NaN while the law does not drive, as the next two.
     pub mark_sigma: f64,
     /// Condition number of the mark stack.
     pub mark_condition: f64,

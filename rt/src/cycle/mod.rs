@@ -4,6 +4,7 @@
 //! the guard. It reads no clock and does no IO; the same inputs give the same outputs to the bit.
 
 mod check;
+mod grip;
 mod io;
 mod probe;
 mod servo;
@@ -12,6 +13,7 @@ mod watch_arm;
 mod watch_vision;
 mod work;
 
+pub use grip::{Grip, same_words};
 pub use io::{
     CommandInput, CommandOutput, Counters, CycleRecord, LinkStatus, Reply, Request, RequestKind, Stage, Transition, Why,
 };
@@ -25,6 +27,7 @@ use crate::mode::{Action, Event, FaultCause, HoldCause, Mode, Reject, step};
 use crate::online::predict::JointHistory;
 use crate::online::screw::Screw;
 use crate::setpoint::SetPoint;
+use grip::Fingers;
 use probe::Probe;
 use servo::{Drive, Motion, Pace};
 use watch_arm::ArmWatch;
@@ -47,6 +50,7 @@ pub struct CommandCycle {
     motion: Option<Motion>,
     probe: Option<Probe>,
     work: Work,
+    fingers: Fingers,
     last_ns: Option<u64>,
     /// Low-passed correction, for convergence.
     filtered: Twist,
@@ -104,6 +108,7 @@ impl CommandCycle {
             motion: None,
             probe: None,
             work: Work::default(),
+            fingers: Fingers::new(&s.task),
             last_ns: None,
             filtered: Twist::zeros(),
             steady: 0,
@@ -214,10 +219,17 @@ impl CommandCycle {
     /// Takes robot state and pictures.
     fn gather(&mut self, input: &CommandInput) {
         let now = input.now_ns;
+        if input.link.connected && !self.arm.connected() {
+            // A new script acts on the first outputs that it is told: what was told to the last one is over.
+            self.outputs = 0;
+        }
         if self.arm.observe(now, input.robot.as_ref(), input.link) {
             self.counters.states += 1;
             if let Some(s) = self.arm.state() {
                 self.history.push(s.received_ns, &s.q);
+                self.fingers.see(&self.config.settings.task, s.output_levels(), now);
+                let tool = s.tool.map(|t| (t, self.config.dh.tool_speed(&s.q, &s.qd, &t.offset)));
+                self.arm.compare_tool(now, tool);
             }
         }
         self.new_frame = false;
@@ -348,7 +360,7 @@ impl CommandCycle {
             return Err(Reject::WrongMode);
         }
         self.may_arm(now)?;
-        if self.work.closed() {
+        if self.fingers.may_hold() {
             return Err(Reject::GripperClosed);
         }
         let good = self.config.settings.watch.good_ns;
@@ -526,7 +538,7 @@ impl CommandCycle {
         } else {
             self.apply(Event::Reached, Why::Progress, now, event);
             let arrived = self.mode == Mode::Converged && stage == Stage::Grasp;
-            if arrived && self.config.settings.task.close_on_arrival && !self.work.closed() {
+            if arrived && self.config.settings.task.close_on_arrival && self.fingers.grip() != Grip::Closed {
                 // The mode is the one in which this is never refused.
                 let _ = self.grip(true, now);
             }
@@ -567,19 +579,20 @@ impl CommandCycle {
             state_age_ns: self.arm.age_ns(now),
             q: state.map_or([0.0; 6], |s| s.q),
             qd: state.map_or([0.0; 6], |s| s.qd),
-            left_from_gripper: pose.unwrap_or_else(Pose::identity),
+            left_from_gripper: pose,
+            grip: self.fingers.grip(),
             reference: self.motion.as_ref().map_or_else(Pose::identity, |m| m.reference.pose()),
-            error_px: d.map_or(0.0, |d| d.screw.error_px),
-            residual_px: d.map_or(0.0, |d| d.screw.residual_px),
+            error_px: d.map_or(f64::NAN, |d| d.screw.error_px),
+            residual_px: d.map_or(f64::NAN, |d| d.screw.residual_px),
             correction: d.map_or_else(Twist::zeros, |d| d.screw.correction),
             screw: d.map_or_else(Twist::zeros, |d| d.xi),
             wanted,
             command,
             held,
             scale,
-            mark_sigma: d.map_or(0.0, |d| d.screw.sigma_min),
-            mark_condition: d.map_or(0.0, |d| d.screw.condition),
-            arm_sigma: d.map_or(0.0, |d| d.arm_sigma),
+            mark_sigma: d.map_or(f64::NAN, |d| d.screw.sigma_min),
+            mark_condition: d.map_or(f64::NAN, |d| d.screw.condition),
+            arm_sigma: d.map_or(f64::NAN, |d| d.arm_sigma),
             arm_joint: d.map_or(0, |d| d.arm_joint),
             counters: self.counters,
             setpoint_id: self.setpoint.map_or(0, |s| s.id),

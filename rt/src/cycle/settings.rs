@@ -67,6 +67,15 @@ pub struct WatchSettings {
     pub uncommanded_rad_per_s: f64,
     /// How long that may last, ns. Default 30 ms.
     pub uncommanded_ns: u64,
+    /// Difference between the controller's speed of its tool point and ours that is always allowed, m/s. Default 0.01: the encoders'
+    /// noise in speed (0.003 rad/s) on a metre of arm, three times.
+    pub tool_m_per_s: f64,
+    /// Share of the faster of the two that is allowed besides. Default 0.1: twice what an arm 30 mm off its table, the most that a
+    /// session is begun with, can make of the half metre between shoulder and tool; a limit of 0.25 m/s is never passed by more than
+    /// 0.04 m/s unnoticed.
+    pub tool_share: f64,
+    /// How long that may last, ns. Default 60 ms.
+    pub tool_ns: u64,
     /// How long after the last set-point a joint may still be moving, ns. Default 250 ms.
     pub settle_ns: u64,
     /// Disagreement of pictures and joints from one picture to the next that is refused, metres (unit-scaled). Default 0.012.
@@ -109,6 +118,9 @@ impl Default for WatchSettings {
             tracking_rad: 0.05,
             uncommanded_rad_per_s: 0.02,
             uncommanded_ns: 30 * MS,
+            tool_m_per_s: 0.01,
+            tool_share: 0.1,
+            tool_ns: 60 * MS,
             settle_ns: 250 * MS,
             jump_m: 0.012,
             mismatch_m: 0.005,

@@ -2,7 +2,7 @@
 
 use super::io::LinkStatus;
 use super::settings::WatchSettings;
-use crate::arm::{Joints, RobotState};
+use crate::arm::{Joints, RobotState, ToolPoint};
 use crate::math;
 use crate::mode::FaultCause;
 
@@ -37,6 +37,9 @@ pub(super) struct ArmWatch {
     off_since_ns: Option<u64>,
     drift: Joints,
     creeping_since_ns: Option<u64>,
+    /// Since when the controller's own tool speed has been another than ours, and both at last, m/s.
+    tool_off_since_ns: Option<u64>,
+    tool: [f64; 2],
     good_since_ns: Option<u64>,
 }
 
@@ -56,6 +59,8 @@ impl ArmWatch {
             off_since_ns: None,
             drift: [0.0; 6],
             creeping_since_ns: None,
+            tool_off_since_ns: None,
+            tool: [0.0; 2],
             good_since_ns: None,
         }
     }
@@ -154,6 +159,23 @@ impl ArmWatch {
         self.creeping_since_ns = if resting && creeping { self.creeping_since_ns.or(Some(now_ns)) } else { None };
     }
 
+    /// Compares the controller's speed of its tool point with `ours` for the same point, by our kinematics: they differ where the
+    /// kinematics do, and then the gripper's speed cap is another than its figure.
+    pub(super) fn compare_tool(&mut self, now_ns: u64, tool: Option<(ToolPoint, f64)>) {
+        let Some((point, ours)) = tool else {
+            self.tool_off_since_ns = None;
+            return;
+        };
+        let [x, y, z, ..] = point.speed;
+        let theirs = math::sqrt(x * x + y * y + z * z);
+        self.tool = [theirs, ours];
+        let w = &self.settings;
+        let allowed = w.tool_m_per_s + w.tool_share * theirs.max(ours);
+        // Written so that NaN counts as a difference.
+        let off = !(math::fabs(theirs - ours) <= allowed);
+        self.tool_off_since_ns = if off { self.tool_off_since_ns.or(Some(now_ns)) } else { None };
+    }
+
     fn slider_of(&self, s: &RobotState) -> f64 {
         (s.speed_scaling.clamp(0.0, 1.0) * s.target_speed_fraction.clamp(0.0, 1.0)).clamp(0.0, 1.0)
     }
@@ -166,6 +188,11 @@ impl ArmWatch {
     /// The newest usable state.
     pub(super) fn state(&self) -> Option<&RobotState> {
         self.state.as_ref()
+    }
+
+    /// Whether there was a link in the last beat.
+    pub(super) fn connected(&self) -> bool {
+        self.link.connected
     }
 
     /// Whether the controller is in reduced mode.
@@ -239,6 +266,10 @@ impl ArmWatch {
             let joint = worst(&s.qd);
             return Some(FaultCause::Uncommanded { joint: joint as u8, velocity: s.qd[joint] });
         }
+        if since(self.tool_off_since_ns, w.tool_ns) {
+            let [controller_m_per_s, ours_m_per_s] = self.tool;
+            return Some(FaultCause::ToolSpeed { controller_m_per_s, ours_m_per_s });
+        }
         let joint = worst(&self.drift);
         if since(self.off_since_ns, w.tracking_ns) || math::fabs(self.drift[joint]) > w.tracking_rad {
             let error: Joints = core::array::from_fn(|i| s.qd[i] - self.sent[self.sent_at].1[i]);
@@ -277,6 +308,7 @@ impl ArmWatch {
         self.drift = [0.0; 6];
         self.off_since_ns = None;
         self.creeping_since_ns = None;
+        self.tool_off_since_ns = None;
     }
 
     /// What would still be wrong after a reset.

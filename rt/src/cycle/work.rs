@@ -24,7 +24,6 @@ pub(super) struct Work {
     busy_until_ns: u64,
     /// A leg of the work is being driven.
     moving: bool,
-    closed: bool,
 }
 
 impl Work {
@@ -36,11 +35,6 @@ impl Work {
     /// Whether nothing is to be done and no leg is under way.
     pub(super) fn idle(&self) -> bool {
         self.steps.is_empty() && !self.moving
-    }
-
-    /// Whether the gripper was last told to close.
-    pub(super) fn closed(&self) -> bool {
-        self.closed
     }
 }
 
@@ -59,7 +53,7 @@ impl CommandCycle {
     fn set_gripper(&mut self, close: bool, now: u64) {
         let t = self.config.settings.task;
         self.outputs = if close { t.close_outputs } else { t.open_outputs };
-        self.work.closed = close;
+        self.fingers.tell(close, now);
         self.work.busy_until_ns = now.saturating_add(t.grip_ns);
     }
 

@@ -12,6 +12,28 @@ pub mod ceiling {
     pub const TCP_SPEED: f64 = 0.5;
 }
 
+/// The longest and widest stop that a configuration may make of its limits, from full speed.
+pub mod stop_bound {
+    /// Time until the rates sent are zero, seconds: twice what the default limits need, which leaves a signal's whole second for it.
+    pub const TIME_S: f64 = 0.3;
+    /// Way of the fastest joint, rad (8.6 degrees): five times what the default limits need.
+    pub const JOINT_RAD: f64 = 0.15;
+    /// Way of the gripper's origin, m: what fingers and the part before them may be off by without being crushed is less, so that a
+    /// wider stop is no stop for this task. Three times what the default limits need.
+    pub const TCP_M: f64 = 0.05;
+}
+
+/// How a stop from full speed goes on the wire, from the first set-point of its ramp.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StopFigures {
+    /// Until the rates sent are zero, seconds.
+    pub time_s: f64,
+    /// Way of the fastest joint, rad.
+    pub joint_rad: f64,
+    /// Way of the gripper's origin, m: both caps reached at once, the longest that its cap allows.
+    pub tcp_m: f64,
+}
+
 /// The longest jerk filter, beats: bounds its memory, and how late it may make a stop.
 pub const MAX_FILTER: usize = 32;
 
@@ -118,7 +140,7 @@ impl Limits {
             }
             velocity[i] = settings.velocity_rad_per_s.min(speed).min(ceiling::VELOCITY);
         }
-        Ok(Self {
+        let limits = Self {
             velocity,
             acceleration: settings.acceleration_rad_per_s2,
             tcp_speed: settings.tcp_speed_m_per_s,
@@ -128,7 +150,24 @@ impl Limits {
             reaction_s: settings.reaction_s,
             period_s,
             filter,
-        })
+        };
+        let stop = limits.stop_figures();
+        within("stop.time_s", stop.time_s, 0.0, stop_bound::TIME_S)?;
+        within("stop.joint_rad", stop.joint_rad, 0.0, stop_bound::JOINT_RAD)?;
+        within("stop.tcp_m", stop.tcp_m, 0.0, stop_bound::TCP_M)?;
+        Ok(limits)
+    }
+
+    /// The guard's own stop from full speed, to the beat: the rates shrink by A T a beat, N beats long, and the mean over the last n
+    /// beats, which begins full of the old rates, follows it by (n - 1) / 2 beats and ends n - 1 beats later.
+    pub fn stop_figures(&self) -> StopFigures {
+        let fastest = self.velocity.iter().fold(0.0_f64, |m, v| m.max(*v));
+        let (step, lag) = (self.acceleration * self.period_s, self.filter as f64 - 1.0);
+        // Beats of the ramp, the last of which is rest.
+        let n = crate::math::ceil(fastest / step - 1e-9).max(1.0);
+        let ramp = (n - 1.0) * fastest - step * (n - 1.0) * n * 0.5;
+        let joint_rad = self.period_s * (ramp + fastest * lag * 0.5);
+        StopFigures { time_s: self.period_s * (n + lag), joint_rad, tcp_m: self.tcp_speed * joint_rad / fastest }
     }
 
     /// Joint speed caps, rad/s.
@@ -151,15 +190,14 @@ impl Limits {
         (self.min, self.max)
     }
 
-    /// Longest time a stop takes on the wire, nanoseconds: full speed at the stop deceleration, and the jerk filter's tail.
+    /// Longest time a stop takes on the wire, nanoseconds, with a beat to spare for one that comes late.
     pub fn ramp_ns(&self) -> u64 {
-        let fastest = self.velocity.iter().fold(0.0_f64, |m, v| m.max(*v));
-        ((fastest / self.acceleration + (self.filter as f64 + 1.0) * self.period_s) * 1e9) as u64
+        ((self.stop_figures().time_s + self.period_s) * 1e9) as u64
     }
 
-    /// Distance the gripper can travel after a condition that takes `detect_s` to notice, metres: what the log prints for a configuration.
-    pub fn stopping_distance(&self, detect_s: f64) -> f64 {
-        self.tcp_speed * (detect_s + self.reaction_s + 0.5e-9 * self.ramp_ns() as f64)
+    /// How long the arm may run on at the old speed after a command changes, seconds.
+    pub fn reaction_s(&self) -> f64 {
+        self.reaction_s
     }
 }
 
@@ -195,5 +233,62 @@ mod tests {
         s.position_max_rad[2] = -7.0;
         assert_eq!(refused(s), "position_max_rad");
         assert_eq!(Limits::new(&d, Model::Ur5e, 1).unwrap_err().key, "period_s");
+    }
+
+    /// What the formula says is what the guard does, from full speed of one joint and of all, at every beat.
+    #[test]
+    fn the_stop_is_the_guards_own_to_the_beat() {
+        use crate::guard::Guard;
+        let d = LimitSettings::default();
+        let jerk = |jerk_rad_per_s3| LimitSettings { jerk_rad_per_s3, ..d };
+        let wide = LimitSettings { position_margin_rad: 0.0, ..d };
+        let sharp = LimitSettings { velocity_rad_per_s: 1.3, acceleration_rad_per_s2: 9.7, ..d };
+        let odd = LimitSettings { velocity_rad_per_s: 0.333, acceleration_rad_per_s2: 2.9, ..d };
+        for settings in [d, jerk(0.0), jerk(150.0), jerk(2000.0), wide, sharp, odd] {
+            for period_ns in [1_000_000_u64, 2_000_000, 8_000_000] {
+                let Ok(limits) = Limits::new(&settings, Model::Ur10e, period_ns) else { continue };
+                let (mut guard, dt) = (Guard::new(limits), limits.period_s);
+                let fastest = limits.velocity[0];
+                let wanted = [fastest, -fastest, 0.5 * fastest, 0.0, 0.0, fastest];
+                // No gripper speed at all, so that its cap does not slow the joints.
+                let still = nalgebra::Matrix6::zeros();
+                for _ in 0..2000 {
+                    guard.step(&wanted, &[0.0; 6], &still, 1.0, dt);
+                }
+                assert!((guard.last()[0] - fastest).abs() < 1e-9, "{settings:?}: not at full speed");
+                let (mut beats, mut way) = (0, 0.0);
+                while !guard.at_rest() {
+                    let sent = guard.stop(dt).rates;
+                    (beats, way) = (beats + 1, way + sent[0] * dt);
+                }
+                let f = limits.stop_figures();
+                assert!((f.time_s - f64::from(beats) * dt).abs() < 1e-9, "{settings:?} {period_ns}: {beats} {f:?}");
+                assert!((f.joint_rad - way).abs() < 1e-9, "{settings:?} {period_ns}: {way} {f:?}");
+                assert!((f.tcp_m - limits.tcp_speed * way / fastest).abs() < 1e-9);
+            }
+        }
+    }
+
+    /// Both sides of each bound.
+    #[test]
+    fn a_stop_that_takes_too_long_or_goes_too_far_is_refused() {
+        let d = LimitSettings::default();
+        let made = |s: LimitSettings| Limits::new(&s, Model::Ur5e, 2_000_000);
+        let refused = |s: LimitSettings| made(s).unwrap_err().key;
+        let slow = |acceleration_rad_per_s2| LimitSettings { acceleration_rad_per_s2, ..d };
+        assert_eq!(refused(slow(0.1)), "stop.time_s");
+        assert_eq!(refused(slow(1.6)), "stop.time_s");
+        assert!(made(slow(1.75)).is_ok());
+        let fast = |velocity_rad_per_s| LimitSettings { velocity_rad_per_s, ..d };
+        assert_eq!(refused(fast(1.15)), "stop.joint_rad");
+        assert!(made(fast(1.0)).is_ok());
+        let far = |tcp_speed_m_per_s| LimitSettings { tcp_speed_m_per_s, velocity_rad_per_s: 1.0, ..d };
+        assert_eq!(refused(far(0.45)), "stop.tcp_m");
+        assert!(made(far(0.35)).is_ok());
+        // A long filter counts as well.
+        assert_eq!(
+            Limits::new(&LimitSettings { jerk_rad_per_s3: 32.0, ..d }, Model::Ur5e, 8_000_000).unwrap_err().key,
+            "stop.time_s"
+        );
     }
 }

@@ -11,7 +11,7 @@
 
 mod limits;
 
-pub use limits::{LimitError, LimitSettings, Limits, MAX_FILTER, ceiling};
+pub use limits::{LimitError, LimitSettings, Limits, MAX_FILTER, StopFigures, ceiling, stop_bound};
 
 use crate::arm::Joints;
 use crate::math;

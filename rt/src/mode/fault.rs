@@ -130,6 +130,13 @@ pub enum FaultCause {
         /// The value.
         value: f64,
     },
+    /// F-ARM-17: the controller's own speed of its tool point is another than ours: our kinematics are not this arm's.
+    ToolSpeed {
+        /// By the controller, m/s.
+        controller_m_per_s: f64,
+        /// By our kinematics, m/s.
+        ours_m_per_s: f64,
+    },
     /// F-TIM-01: the loop was not run for too long.
     Stalled {
         /// How long, ns.
@@ -168,6 +175,7 @@ impl FaultCause {
             FaultCause::TrackingError { .. } => "F-ARM-14",
             FaultCause::Uncommanded { .. } => "F-ARM-15",
             FaultCause::StateAbsurd { .. } => "F-ARM-16",
+            FaultCause::ToolSpeed { .. } => "F-ARM-17",
             FaultCause::Stalled { .. } => "F-TIM-01",
             FaultCause::TimeBack => "F-TIM-02",
             FaultCause::Internal => "F-INT-01",
@@ -261,6 +269,11 @@ impl fmt::Display for FaultCause {
                 write!(f, "joint {joint} moves at {velocity:.3} rad/s without being told to")
             }
             FaultCause::StateAbsurd { joint, value } => write!(f, "robot value of joint {joint} is absurd: {value}"),
+            FaultCause::ToolSpeed { controller_m_per_s, ours_m_per_s } => write!(
+                f,
+                "the controller says that its TCP moves at {controller_m_per_s:.3} m/s, by our kinematics it is {ours_m_per_s:.3} m/s: \
+                 arm.kinematics is not this arm's"
+            ),
             FaultCause::Stalled { for_ns } => write!(f, "the loop stood still for {:.1} ms", ms(for_ns)),
             FaultCause::TimeBack => write!(f, "the monotonic clock went back"),
             FaultCause::Internal => write!(f, "a defect was caught inside the daemon; see the log"),
@@ -439,7 +452,9 @@ impl Reject {
             Reject::OneView => {
                 "only one view shows the marks: clear the other, or check whether its camera was moved; or set views to the one that does"
             }
-            Reject::GripperClosed => "the gripper is closed: open it first",
+            Reject::GripperClosed => {
+                "the gripper is closed on something, or its outputs do not show that it is open: open it first"
+            }
             Reject::BadValue => "a value of the request is out of range",
         }
     }
@@ -475,6 +490,7 @@ mod tests {
             FaultCause::TrackingError { joint: 0, velocity: 0.0, position: 0.0 },
             FaultCause::Uncommanded { joint: 0, velocity: 0.0 },
             FaultCause::StateAbsurd { joint: 0, value: 0.0 },
+            FaultCause::ToolSpeed { controller_m_per_s: 0.0, ours_m_per_s: 0.0 },
             FaultCause::Stalled { for_ns: 0 },
             FaultCause::TimeBack,
             FaultCause::Internal,

@@ -46,6 +46,7 @@ pub use message::{
 pub use phase::PhaseLock;
 pub use recipe::{Answer, Entry, Recipe, RecipeError, Slot, answers, join, names};
 pub use robot::{
-    COMMAND_FIELDS, ClockStep, CommandWriter, GapMeter, SCRIPT_VERSION, STATE_FIELDS, StateReader, script_state,
+    COMMAND_FIELDS, ClockStep, CommandWriter, GapMeter, NEEDED_FIELDS, SCRIPT_VERSION, STATE_FIELDS, StateReader,
+    script_state,
 };
 pub use value::{FieldType, Value, Wire};

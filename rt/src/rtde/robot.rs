@@ -3,10 +3,13 @@
 use super::message::{Kind, NoRoom, package};
 use super::recipe::{Recipe, Slot};
 use super::value::Wire;
-use crate::arm::{ArmCommand, ArmMode, Joints, RobotState};
+use crate::arm::{ArmCommand, ArmMode, Joints, RobotState, ToolPoint};
+
+/// How many of [`STATE_FIELDS`] every controller has; the others came with later software, and a session does without them.
+pub const NEEDED_FIELDS: usize = 17;
 
 /// Output variables of the control session.
-pub const STATE_FIELDS: [&str; 17] = [
+pub const STATE_FIELDS: [&str; 19] = [
     "timestamp",
     "actual_q",
     "actual_qd",
@@ -24,6 +27,8 @@ pub const STATE_FIELDS: [&str; 17] = [
     "output_int_register_26",
     "output_int_register_27",
     "output_int_register_28",
+    "tcp_offset",
+    "actual_TCP_speed",
 ];
 
 /// Input variables of the control session: one recipe, written whole with every command, so that no step of the script can
@@ -80,10 +85,11 @@ pub struct StateReader {
     scales: [Slot<f64>; 2],
     digital: Slot<u64>,
     script: [Slot<i32>; 5],
+    tool: Option<[Slot<Joints>; 2]>,
 }
 
 impl StateReader {
-    /// Resolves the places; `None` when the recipe lacks one of [`STATE_FIELDS`].
+    /// Resolves the places; `None` when the recipe lacks one of the first [`NEEDED_FIELDS`] of [`STATE_FIELDS`].
     pub fn new<const N: usize>(recipe: &Recipe<N>) -> Option<StateReader> {
         let s = |n| recipe.slot::<i32>(n);
         Some(StateReader {
@@ -110,6 +116,7 @@ impl StateReader {
                 s("output_int_register_27")?,
                 s("output_int_register_28")?,
             ],
+            tool: recipe.slot("tcp_offset").zip(recipe.slot("actual_TCP_speed")).map(|(a, b)| [a, b]),
         })
     }
 
@@ -143,6 +150,10 @@ impl StateReader {
             speed_scaling: scaling.read(values)?,
             target_speed_fraction: fraction.read(values)?,
             digital_outputs: self.digital.read(values)?,
+            tool: match &self.tool {
+                Some([offset, speed]) => Some(ToolPoint { offset: offset.read(values)?, speed: speed.read(values)? }),
+                None => None,
+            },
             echo: echo.read(values)?,
             script_state: state.read(values)?,
             script_fault: fault.read(values)?,

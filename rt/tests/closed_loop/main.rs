@@ -3,6 +3,7 @@
 
 mod heap;
 mod knocks;
+mod restart;
 mod world;
 
 use graspd_rt::arm::ArmMode;

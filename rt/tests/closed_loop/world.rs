@@ -1,7 +1,7 @@
 //! A world in lock step: an arm that is not quite the model, a rig placed at random, marks as points.
 #![allow(clippy::unwrap_used)] // a test's own world: a surprise in it has to be loud
 
-use graspd_rt::arm::{ArmCommand, ArmMode, Dh, Joints, Model, READY, RobotState};
+use graspd_rt::arm::{ArmCommand, ArmMode, Dh, Joints, Model, READY, RobotState, ToolPoint};
 use graspd_rt::cycle::{
     CommandCycle, CommandInput, CommandOutput, CycleConfig, CycleSettings, LinkStatus, Request, RequestKind,
 };
@@ -105,8 +105,17 @@ pub(crate) struct World {
     pending: ArmCommand,
     pub(crate) sent: Vec<(u64, Joints)>,
     pub(crate) outputs: u32,
+    /// `actual_digital_output_bits`.
+    pub(crate) levels: u64,
+    /// The controller tells its tool point's speed, this many times the true one.
+    pub(crate) tool: Option<f64>,
     /// Time that each step of the cycle took, ns.
     pub(crate) step_ns: Vec<u64>,
+}
+
+/// The script's output numbers at their places on the wire: the tool's lie behind the configurable ones.
+fn wire(word: u64) -> u64 {
+    word & 0xff | (word & 0x300) << 8
 }
 
 fn gripper() -> Gripper {
@@ -145,6 +154,7 @@ impl World {
         let rig = Rig { left: camera(1.0), right: camera(-2.0), right_from_left };
         let mut settings = CycleSettings::default();
         tune(&mut settings);
+        let open = settings.task.open_outputs;
         let config = CycleConfig { model, dh, rig, gripper, settings };
         let pregrasp = goal * Pose::translation(0.0, 0.0, -0.07);
         let setpoint = SetPoint {
@@ -185,6 +195,9 @@ impl World {
             pending: ArmCommand::default(),
             sent: Vec::new(),
             outputs: 0,
+            // Begins with an open gripper.
+            levels: wire(u64::from(open & 0xffff)),
+            tool: None,
             step_ns: Vec::new(),
         }
     }
@@ -333,6 +346,12 @@ impl World {
         v
     }
 
+    /// What a controller says of its tool point, at the flange, whose speed is this many times the true one.
+    fn tool_point(&self, scale: f64) -> ToolPoint {
+        let speed = self.true_dh.tool_speed(&self.q, &self.qd, &[0.0; 6]);
+        ToolPoint { offset: [0.0; 6], speed: [speed * scale, 0.0, 0.0, 0.0, 0.0, 0.0] }
+    }
+
     fn state(&mut self, beat: i32) -> RobotState {
         let f = self.faults;
         let mut s = RobotState {
@@ -348,7 +367,8 @@ impl World {
             runtime_state: f.runtime.unwrap_or(2),
             speed_scaling: 1.0,
             target_speed_fraction: if f.slider_zero { 0.0 } else { self.slider },
-            digital_outputs: 0,
+            digital_outputs: self.levels,
+            tool: self.tool.map(|scale| self.tool_point(scale)),
             echo: if f.echo_stuck { 12345 } else { beat },
             script_state: 1,
             script_fault: i32::from(f.script_fault),
@@ -445,6 +465,8 @@ impl World {
         self.step_ns.push(before.elapsed().as_nanos() as u64);
         self.pending = output.command;
         self.outputs = output.command.outputs;
+        let (mask, values) = (u64::from(self.outputs >> 16), u64::from(self.outputs & 0xffff));
+        self.levels = self.levels & !wire(mask) | wire(values & mask);
         self.sent.push((self.now, output.command.rates));
         output
     }

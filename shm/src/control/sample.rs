@@ -72,7 +72,7 @@ pub struct TelemetrySample {
     pub command: [f64; 6],
     /// Commanded screw in the gripper frame, m/s and rad/s.
     pub screw: [f64; 6],
-    /// Gripper in the left camera's frame: x, y, z, then quaternion w, x, y, z.
+    /// Gripper in the left camera's frame: x, y, z, then quaternion w, x, y, z; NaN before the marks were seen.
     pub left_from_gripper: [f64; 7],
     /// Root mean square of the image error of all marks against the present goal, px; NaN without one.
     pub error_px: f64,
@@ -133,7 +133,7 @@ impl Default for TelemetrySample {
             qd: [0.0; 6],
             command: [0.0; 6],
             screw: [0.0; 6],
-            left_from_gripper: [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0],
+            left_from_gripper: [f64::NAN; 7],
             error_px: f64::NAN,
             residual_px: f64::NAN,
             distance_m: f64::NAN,

@@ -3,6 +3,7 @@
 pub mod controller;
 mod host;
 pub mod mock_arm;
+mod numbers;
 pub mod plant;
 pub mod scenario;
 pub mod scene;

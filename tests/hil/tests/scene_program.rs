@@ -170,3 +170,57 @@ fn bad_input_ends_with_the_documented_code_and_a_reason() {
         assert!(said.contains(part), "{args:?}: {said}");
     }
 }
+
+/// The options take numbers as their own help writes them.
+#[test]
+fn rows_of_numbers_are_taken_in_the_form_of_the_help() {
+    let dir = std::env::temp_dir().join(format!("graspd-scene-args-{}", std::process::id()));
+    let _ = std::fs::remove_dir_all(&dir);
+    let make = |to: &str, extra: &[&str]| {
+        let mut c = Command::new(env!("CARGO_BIN_EXE_graspd-scene"));
+        c.args(["--seed", "5"]).args(extra).arg("--make-world").arg(dir.join(to)).output().unwrap()
+    };
+    assert!(make("plain", &[]).status.success());
+    let out = make("wrong", &["--rig-error", "0.5,0.1", "--kinematics-error", "0.5,0.1"]);
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let read = |to: &str, file: &str| std::fs::read_to_string(dir.join(to).join(file)).unwrap();
+    for file in ["rig.toml", "arm.toml"] {
+        assert_ne!(read("plain", file), read("wrong", file), "{file}");
+    }
+    assert_eq!(read("plain", "true_rig.toml"), read("wrong", "true_rig.toml"));
+    for (option, bad) in
+        [("--rig-error", "0.5"), ("--kinematics-error", "1,2,3"), ("--rig-error", "a,b"), ("--rig-error", "nan,0")]
+    {
+        let out = make("bad", &[option, bad]);
+        assert_eq!(out.status.code(), Some(2), "{option} {bad}");
+        assert!(String::from_utf8_lossy(&out.stderr).contains("2 numbers"), "{option} {bad}");
+    }
+    let pictures = |joints: &str| {
+        let mut c = Command::new(env!("CARGO_BIN_EXE_graspd-scene"));
+        c.arg("--world").arg(dir.join("plain")).args(["--joints", joints, "--pictures"]).arg(dir.join("pictures"));
+        c.output().unwrap()
+    };
+    assert!(pictures("-0.1,-1.6,1.9,-1.87,-1.57,0").status.success());
+    assert_eq!(pictures("1,2,3").status.code(), Some(2));
+    std::fs::remove_dir_all(&dir).unwrap();
+}
+
+/// docs/SCENE.md names every fault, in a form that is taken.
+#[test]
+fn the_document_names_every_fault() {
+    let text = include_str!("../../../docs/SCENE.md");
+    let lines: Vec<&str> = text.split('`').filter(|part| part.starts_with("{\"fault\":")).collect();
+    let mut scene = Scene::start("doc", &[]);
+    let unknown = scene.ask(r#"{"fault":"nothing_of_the_kind"}"#);
+    let known: Vec<String> =
+        unknown["error"].as_str().unwrap().split('`').skip(3).step_by(2).map(str::to_owned).collect();
+    assert!(known.len() > 20, "{unknown}");
+    for name in &known {
+        let named = lines.iter().any(|l| l.starts_with(&format!("{{\"fault\":\"{name}\"")));
+        assert!(named, "docs/SCENE.md does not name {name}");
+    }
+    for line in lines {
+        assert_eq!(scene.ask(line)["ok"], true, "{line}");
+    }
+    assert_eq!(scene.ask(r#"{"clear":true}"#)["ok"], true);
+}

@@ -5,6 +5,7 @@ use super::robot::{Robot, Setup};
 use super::server::{Server, now_ns};
 use super::state::RobotMode;
 use super::world::World;
+use crate::numbers::numbers;
 use crate::plant::{Kinematics, Model};
 use clap::Parser;
 use serde_json::json;
@@ -113,12 +114,6 @@ where
             2
         }
     }
-}
-
-/// Numbers joined by commas, as many as are needed.
-fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
-    let all: Result<Vec<f64>, _> = text.split(',').map(|n| n.trim().parse::<f64>()).collect();
-    all.ok().and_then(|v| v.try_into().ok()).ok_or_else(|| format!("give {N} numbers joined by commas"))
 }
 
 fn setup(args: &Args) -> Result<Setup, StartError> {

@@ -1,5 +1,6 @@
 //! The command line of `graspd-scene`.
 
+use crate::numbers::numbers;
 use crate::scenario::Options;
 use clap::Parser;
 use std::path::PathBuf;
@@ -28,8 +29,8 @@ pub struct Args {
     #[arg(long, value_name = "HOST:PORT", conflicts_with = "joints")]
     pub rtde: Option<String>,
     /// Show the arm at these joints (rad) instead; without this and --rtde, at the world's start
-    #[arg(long, value_delimiter = ',', num_args = 6, value_name = "Q1,..,Q6", allow_negative_numbers = true)]
-    pub joints: Option<Vec<f64>>,
+    #[arg(long, value_parser = numbers::<6>, value_name = "Q1,..,Q6", allow_hyphen_values = true)]
+    pub joints: Option<[f64; 6]>,
     /// Stereo pairs a second
     #[arg(long, default_value_t = 60.0, value_name = "HZ")]
     pub rate: f64,
@@ -64,11 +65,11 @@ pub struct Args {
     #[arg(long, value_name = "S")]
     pub max_seconds: Option<f64>,
     /// With --seed: error of each DH length and angle that graspd is told, mm and degrees
-    #[arg(long, value_delimiter = ',', num_args = 2, value_name = "MM,DEG")]
-    pub kinematics_error: Option<Vec<f64>>,
+    #[arg(long, value_parser = numbers::<2>, value_name = "MM,DEG", allow_hyphen_values = true)]
+    pub kinematics_error: Option<[f64; 2]>,
     /// With --seed: error of focal length and relative rotation of the rig that graspd is told, per cent and degrees
-    #[arg(long, value_delimiter = ',', num_args = 2, value_name = "PERCENT,DEG")]
-    pub rig_error: Option<Vec<f64>>,
+    #[arg(long, value_parser = numbers::<2>, value_name = "PERCENT,DEG", allow_hyphen_values = true)]
+    pub rig_error: Option<[f64; 2]>,
     /// With --seed: hidden part of the rim, per cent
     #[arg(long, default_value_t = 0.0, value_name = "PERCENT")]
     pub rim_occlusion: f64,
@@ -84,10 +85,10 @@ impl Args {
     /// What a world is drawn with.
     pub(super) fn options(&self) -> Options {
         let mut o = Options { noise: self.noise, rim_occlusion: self.rim_occlusion / 100.0, ..Default::default() };
-        if let Some(&[mm, deg]) = self.kinematics_error.as_deref() {
+        if let Some([mm, deg]) = self.kinematics_error {
             (o.kinematics_error_mm, o.kinematics_error_deg) = (mm, deg);
         }
-        if let Some(&[percent, deg]) = self.rig_error.as_deref() {
+        if let Some([percent, deg]) = self.rig_error {
             (o.focal_error, o.rotation_error_deg) = (percent / 100.0, deg);
         }
         if self.bare_wheel {

@@ -116,7 +116,11 @@ fn run(args: &Args) -> Result<(), SceneError> {
         let value = serde_json::from_str(text).map_err(|e| bad(e.to_string()))?;
         shared.add(Timed::parse(&value, now_ns()).map_err(bad)?);
     }
-    let root = args.shm_root.clone().unwrap_or_else(Names::default_root);
+    let root = match &args.shm_root {
+        // Relative to where the program was started, as every other path of its options.
+        Some(root) => std::path::absolute(root).unwrap_or_else(|_| root.clone()),
+        None => Names::default_root(),
+    };
     let prefix = args.shm_prefix.clone().unwrap_or_else(Names::default_prefix);
     let names = Names::new(root, &prefix, &args.cell)?;
     let stop = stop_flag(args)?;

@@ -1,0 +1,102 @@
+//! What a loop must know that has just begun: what the gripper holds, and whether the arm's kinematics are the controller's.
+
+use super::converge;
+use super::world::World;
+use graspd_rt::cycle::{CommandCycle, Grip, RequestKind};
+use graspd_rt::mode::{ModeName, Reject};
+
+/// A converged world whose gripper has been closed, and whose loop has been started afresh.
+fn restarted() -> World {
+    let mut w = World::new(1, |s| {
+        s.task.close_outputs = 0x0201_0001;
+        s.task.open_outputs = 0x0201_0200;
+    });
+    converge(&mut w, 20).unwrap();
+    assert_eq!(w.beat(Some(RequestKind::Gripper { close: true }), false).reply.unwrap().result, Ok(()));
+    w.run(1_500);
+    assert_eq!(w.cycle.mode().name(), ModeName::Converged);
+    w.cycle = CommandCycle::new(w.config.clone()).unwrap();
+    w.run(600);
+    w
+}
+
+fn ask(w: &mut World, kind: RequestKind) -> Result<(), Reject> {
+    w.beat(Some(kind), false).reply.unwrap().result
+}
+
+#[test]
+fn a_restart_remembers_what_the_gripper_holds() {
+    let mut w = restarted();
+    let out = w.beat(None, true);
+    assert_eq!((out.record.grip, out.command.outputs), (Grip::Closed, 0), "it only looks");
+    assert_eq!(ask(&mut w, RequestKind::Arm), Ok(()));
+    w.run(300);
+    assert_eq!(ask(&mut w, RequestKind::Servo), Err(Reject::GripperClosed));
+    assert_eq!(ask(&mut w, RequestKind::Gripper { close: false }), Ok(()));
+    w.run(300);
+    assert_eq!(w.beat(None, false).record.grip, Grip::Open);
+    assert_eq!(ask(&mut w, RequestKind::Servo), Ok(()));
+}
+
+#[test]
+fn outputs_that_mean_neither_count_as_closed_and_the_pendant_may_open() {
+    let mut w = restarted();
+    w.levels = 0;
+    assert_eq!(w.beat(None, true).record.grip, Grip::Unknown);
+    assert_eq!(ask(&mut w, RequestKind::Arm), Ok(()));
+    w.run(300);
+    assert_eq!(ask(&mut w, RequestKind::Servo), Err(Reject::GripperClosed));
+    // Tool output 1, where the wire has it.
+    w.levels = 1 << 17;
+    w.run(10);
+    assert_eq!(ask(&mut w, RequestKind::Servo), Ok(()));
+}
+
+/// A new script acts on the first outputs that it hears: those of the session before must not be among them.
+#[test]
+fn a_new_link_is_not_told_what_the_last_one_was_told() {
+    let mut w = World::new(1, |s| {
+        s.task.close_outputs = 0x0001_0001;
+        s.task.open_outputs = 0x0001_0000;
+    });
+    w.run(500);
+    assert_eq!(ask(&mut w, RequestKind::Gripper { close: true }), Ok(()));
+    w.run(200);
+    assert_eq!(w.outputs, 0x0001_0001);
+    w.faults.link_down = true;
+    w.run(50);
+    // Somebody opens it on the pendant while there is no session.
+    w.levels = 0;
+    w.faults.link_down = false;
+    let out = w.run(300);
+    assert_eq!((out.command.outputs, w.levels, out.record.grip), (0, 0, Grip::Open));
+}
+
+/// The controller's speed of its tool point against ours, on both sides of what is allowed.
+#[test]
+fn a_tool_that_is_faster_than_we_think_stops_the_arm() {
+    for (scale, fault) in [(1.0, false), (0.92, false), (1.08, false), (1.25, true), (0.75, true)] {
+        let mut w = World::new(3, |_| {});
+        w.tool = Some(scale);
+        let arrived = converge(&mut w, 20);
+        let code = w.cycle.mode().fault().map(|f| f.cause.code());
+        assert_eq!((arrived.is_some(), code), (!fault, fault.then_some("F-ARM-17")), "{scale}: {arrived:?}");
+        w.judge_wire();
+    }
+}
+
+/// What was not measured is not a number.
+#[test]
+fn nothing_measured_is_no_zero() {
+    let mut w = World::new(2, |_| {});
+    w.faults.no_vision = true;
+    let r = w.run(100).record;
+    assert!(
+        r.left_from_gripper.is_none() && r.error_px.is_nan() && r.residual_px.is_nan() && r.mark_condition.is_nan()
+    );
+    w.faults.no_vision = false;
+    w.run(500);
+    w.start();
+    let r = w.run(200).record;
+    assert!(r.left_from_gripper.is_some() && r.error_px.is_finite() && r.residual_px.is_finite());
+}
