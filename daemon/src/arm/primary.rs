@@ -225,4 +225,20 @@ mod tests {
             parse_identity(&real, &mut known);
         }
     }
+
+    /// A file's table against the controller's, on both sides of what one arm may differ by, and with a number that is none.
+    #[test]
+    fn kinematics_of_another_arm_are_refused() {
+        let dh = Dh::nominal(Model::Ur5e);
+        let identity = Identity { robot_type: 1, dh };
+        let longer = |m: f64| {
+            let mut other = dh;
+            other.d[0] += m;
+            check_kinematics(&identity, &other)
+        };
+        assert!(longer(0.0).is_ok() && longer(0.029).is_ok());
+        let said = longer(0.031).unwrap_err().to_string();
+        assert!(said.contains("31 mm") && said.contains("arm.kinematics"), "{said}");
+        assert!(longer(f64::NAN).is_err());
+    }
 }

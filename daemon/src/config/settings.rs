@@ -28,7 +28,7 @@ pub enum Kinematics {
     /// The model's published values.
     Nominal,
     /// A file, read and held against the model.
-    File(PathBuf, Dh),
+    File(PathBuf, Box<Dh>),
 }
 
 /// A configuration in which every value is in range and every named file was read.
@@ -155,7 +155,7 @@ impl Config {
             "nominal" => Kinematics::Nominal,
             file => {
                 let file = folder.join(file);
-                let dh = load_kinematics(&file, model)?;
+                let dh = Box::new(load_kinematics(&file, model)?);
                 Kinematics::File(file, dh)
             }
         };

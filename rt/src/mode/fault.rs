@@ -284,6 +284,11 @@ pub enum HoldCause {
     },
     /// H-11: the law found no finite solution in this beat.
     NoSolution,
+    /// H-15: the controller leaves out too many of its states (R11).
+    StatesMissing {
+        /// Share that came in the last second, 0 to 1.
+        share: f64,
+    },
     /// H-02: the marks seen do not fix the motion (B12).
     Geometry {
         /// Smallest singular value, px/m.
@@ -333,6 +338,7 @@ impl HoldCause {
             HoldCause::MarksLost => "H-01",
             HoldCause::FewPoints { .. } => "H-10",
             HoldCause::NoSolution => "H-11",
+            HoldCause::StatesMissing { .. } => "H-15",
             HoldCause::Geometry { .. } => "H-02",
             HoldCause::Singular { .. } => "H-03",
             HoldCause::JointEnd { .. } => "H-04",
@@ -356,6 +362,11 @@ impl fmt::Display for HoldCause {
             HoldCause::NoSolution => {
                 write!(f, "the law found no finite solution: stop, and look at rig and gripper files")
             }
+            HoldCause::StatesMissing { share } => write!(
+                f,
+                "only {:.0} % of the controller's states came within a second: look at its load and at the network",
+                share * 100.0
+            ),
             HoldCause::Geometry { sigma_min, condition } => write!(
                 f,
                 "the marks seen do not fix the motion (sigma {sigma_min:.1} px/m, condition {condition:.0}): show more marks"
@@ -402,6 +413,8 @@ pub enum Reject {
     Settling,
     /// A number in the request is not finite or out of range.
     BadValue,
+    /// The controller leaves out too many of its states.
+    StatesMissing,
     /// The gripper is closed on something: open it before the arm may leave.
     GripperClosed,
 }
@@ -422,6 +435,9 @@ impl Reject {
             Reject::Settling => "wait until pictures and robot state have been good for 200 ms",
             Reject::GripperClosed => {
                 "the gripper is closed on something, or its outputs do not show that it is open: open it first"
+            }
+            Reject::StatesMissing => {
+                "the controller leaves out too many of its states: look at its load and at the network"
             }
             Reject::BadValue => "a value of the request is out of range",
         }
