@@ -91,8 +91,8 @@ pub fn names(cell: &str, root: Option<&Path>) -> Result<Names, Failure> {
     .map_err(|e| Failure::input(e.to_string()))
 }
 
-/// The path from the root of the file system, without `..`. The last name is left as it is, be it a link or not yet there: whoever
-/// opens it judges it.
+/// The path from the root of the file system, without `..`. The last name is left as it is, be it a link or not yet
+/// there: whoever opens it judges it.
 fn full_path(path: &Path) -> std::io::Result<PathBuf> {
     let path = std::path::absolute(path)?;
     let Some(last) = path.file_name() else { return Ok(path) };

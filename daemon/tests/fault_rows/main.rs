@@ -372,8 +372,8 @@ fn a_link_that_ends_says_why() {
     }
 }
 
-/// Kinematics that are not the arm's make the gripper's speed cap another than its figure: the controller's own word on its tool
-/// point says so, wherever that point is. A controller that does not say it is driven all the same.
+/// Kinematics that are not the arm's make the gripper's speed cap another than its figure: the controller's own word on
+/// its tool point says so, wherever that point is. A controller that does not say it is driven all the same.
 #[test]
 fn kinematics_that_are_not_the_arms_are_noticed_by_the_controllers_own_speed() {
     let tool = Command::Tcp { pose: [0.02, -0.03, 0.17, 0.1, 0.2, -0.3] };

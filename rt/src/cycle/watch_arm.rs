@@ -192,8 +192,8 @@ impl ArmWatch {
         self.creeping_since_ns = if resting && creeping { self.creeping_since_ns.or(Some(now_ns)) } else { None };
     }
 
-    /// Compares the controller's speed of its tool point with `ours` for the same point, by our kinematics: they differ where the
-    /// kinematics do, and then the gripper's speed cap is another than its figure.
+    /// Compares the controller's speed of its tool point with `ours` for the same point, by our kinematics: they differ
+    /// where the kinematics do, and then the gripper's speed cap is another than its figure.
     pub(super) fn compare_tool(&mut self, now_ns: u64, tool: Option<(ToolPoint, f64)>) {
         let Some((point, ours)) = tool else {
             self.tool_off_since_ns = None;

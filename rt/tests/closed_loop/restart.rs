@@ -1,4 +1,5 @@
-//! What a loop must know that has just begun: what the gripper holds, and whether the arm's kinematics are the controller's.
+//! What a loop must know that has just begun: what the gripper holds, and whether the arm's kinematics are the
+//! controller's.
 
 use super::converge;
 use super::world::{MS, World};
