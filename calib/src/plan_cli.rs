@@ -166,7 +166,7 @@ fn options(r: &Request) -> Result<PlanOptions, Failure> {
         o.rim.max_sigma_normal = deg.to_radians();
     }
     if let Some(px) = checked("calibration-px", r.calibration_px, 0.0, 20.0)? {
-        o.rim.calibration_px = px;
+        o.calibration_px = Some(px);
     }
     o.approach.present = r.present;
     o.approach.max_turn = r.max_turn;
@@ -194,7 +194,7 @@ fn work(r: &Request) -> Result<Outcome, Failure> {
             format!("{} and {} are the same picture: give one of each camera", r.left.display(), r.right.display()),
         ));
     }
-    let views = Prepared::new(pictures, &rig).map_err(|e| failed(&e))?;
+    let views = Prepared::with_prior(pictures, &rig, &options.prior(&rig)).map_err(|e| failed(&e))?;
     let done = match (left, right) {
         (Some(l), Some(s)) if !r.auto => views.plan([&l, &s], &gripper, &options).map_err(|e| failed(&e))?,
         _ => {

@@ -171,7 +171,7 @@ fn kinematics(
     stop: &AtomicBool,
 ) -> Result<Option<Dh>, Failure> {
     match (&config.kinematics, config.link) {
-        (Kinematics::File(_, dh), _) => Ok(Some(*dh)),
+        (Kinematics::File(_, dh), _) => Ok(Some(**dh)),
         (Kinematics::Nominal, _) | (Kinematics::Controller, LinkKind::Mock) => Ok(Some(Dh::nominal(config.model))),
         (Kinematics::Controller, LinkKind::Rtde) => loop {
             match crate::arm::read_identity(&ur_config(config)) {

@@ -231,7 +231,7 @@ fn requests_from_the_future_and_edited_plans_are_refused() {
     }
     assert!(send(Verb::Stop, b"", 3_600_000_000_000).0, "a stop is never too early");
     // Every value that matters, and a comment that does not.
-    let edits: [(&str, &dyn Fn(&str) -> String); 5] = [
+    let edits: [(&str, &Edit); 5] = [
         ("opening", &|t| edit(t, "opening_m = ", "opening_m = 0.0123")),
         ("standoff", &|t| edit(t, "standoff_m = ", "standoff_m = 0.5")),
         ("best view", &|t| {
@@ -263,6 +263,9 @@ fn requests_from_the_future_and_edited_plans_are_refused() {
     let changed = status["configuration_changed"].as_array().unwrap();
     assert!(changed.len() == 1 && changed[0].as_str().unwrap().ends_with("graspd.toml"), "{status}");
 }
+
+/// What an operator does to a plan in an editor.
+type Edit = dyn Fn(&str) -> String;
 
 /// The first line that begins with `key` becomes `line`.
 fn edit(text: &str, key: &str, line: &str) -> String {
@@ -331,7 +334,8 @@ fn a_plan_does_not_overwrite_what_it_is_made_from() {
     assert_eq!(out.status.code(), Some(2), "{}", said(&out));
 }
 
-/// A relative root means one place, from whatever folder the programs are started, and whatever the path to it looks like.
+/// A relative root means one place, from whatever folder the programs are started, and whatever the path to it looks
+/// like.
 #[test]
 fn a_relative_root_is_one_place() {
     let world = World::new(30);

@@ -1,4 +1,5 @@
-//! A program's outputs must not be its inputs: what is about to be written is held against what was read, by the file and not by its name.
+//! A program's outputs must not be its inputs: what is about to be written is held against what was read, by the file
+//! and not by its name.
 
 use std::path::{Path, PathBuf};
 
@@ -23,7 +24,8 @@ pub fn keep_apart(outputs: &[(&str, Option<&Path>)], inputs: &[(&str, Option<&Pa
     Ok(())
 }
 
-/// Whether two paths lead to one file: by the file itself where both are there (links included), otherwise by their full names.
+/// Whether two paths lead to one file: by the file itself where both are there (links included), otherwise by their
+/// full names.
 fn same_file(a: &Path, b: &Path) -> bool {
     use std::os::unix::fs::MetadataExt as _;
     if let (Ok(x), Ok(y)) = (std::fs::metadata(a), std::fs::metadata(b)) {

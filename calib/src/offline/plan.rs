@@ -29,8 +29,8 @@ pub struct PlanOptions {
     pub rim: model::Options,
     /// Of the approach.
     pub approach: Approach,
-    /// What the rig file may have wrong.
-    pub rig: RigPrior,
+    /// Epipolar displacement that the rig file may have wrong, pixels (one standard deviation); `None` for its stated quality, or the default.
+    pub calibration_px: Option<f64>,
 }
 
 impl Default for PlanOptions {
@@ -39,8 +39,16 @@ impl Default for PlanOptions {
         Self {
             rim: model::Options { calibration_px: 1.0, edge_bias_px: 0.1, ..model::Options::default() },
             approach: Approach::default(),
-            rig: RigPrior::default(),
+            calibration_px: None,
         }
+    }
+}
+
+impl PlanOptions {
+    /// What the rig file may have wrong.
+    pub fn prior(&self, rig: &RigFile) -> RigPrior {
+        let stated = RigPrior(rig.error());
+        self.calibration_px.map_or(stated, |px| stated.displacing(&rig.rig, px))
     }
 }
 
@@ -145,9 +153,9 @@ pub struct Prepared<'a> {
 }
 
 impl<'a> Prepared<'a> {
-    /// The same for a rig of unstated quality.
+    /// The same for a rig of the quality that its file states.
     pub fn new(pictures: [&'a Picture; 2], rig: &'a RigFile) -> Result<Self, PlanError> {
-        Self::with_prior(pictures, rig, &RigPrior::default())
+        Self::with_prior(pictures, rig, &RigPrior(rig.error()))
     }
 
     /// Checks the images' sizes, holds the images against the rig file, and finds their edges.
@@ -273,7 +281,7 @@ pub fn plan(
     gripper: &GripperFile,
     options: &PlanOptions,
 ) -> Result<Plan, PlanError> {
-    Prepared::with_prior(pictures, rig, &options.rig)?.plan(selections, gripper, options)
+    Prepared::with_prior(pictures, rig, &options.prior(rig))?.plan(selections, gripper, options)
 }
 
 /// The rest of the stage, from each view's candidate contours.

@@ -162,8 +162,8 @@ pub fn check_kinematics(identity: &Identity, dh: &Dh) -> Result<(), ArmError> {
     Ok(())
 }
 
-/// How far apart two tables put the flange, at worst, m. Calibrated tables differ in single numbers by metres (parallel axes) and in
-/// the flange by millimetres, so that only the flange tells.
+/// How far apart two tables put the flange, at worst, m. Calibrated tables differ in single numbers by metres (parallel
+/// axes) and in the flange by millimetres, so that only the flange tells.
 pub fn flanges_apart(a: &Dh, b: &Dh) -> f64 {
     let places = [[0.0; 6], [0.5, -1.2, 1.0, -0.7, 1.3, 0.2], [-1.0, -0.4, -1.5, 0.9, -1.1, 2.0]];
     places.iter().fold(0.0, |worst: f64, q| {
@@ -224,5 +224,22 @@ mod tests {
             real.truncate(cut);
             parse_identity(&real, &mut known);
         }
+    }
+
+    /// A file's table against the controller's, on both sides of what one arm may differ by, and with a number that is
+    /// none.
+    #[test]
+    fn kinematics_of_another_arm_are_refused() {
+        let dh = Dh::nominal(Model::Ur5e);
+        let identity = Identity { robot_type: 1, dh };
+        let longer = |m: f64| {
+            let mut other = dh;
+            other.d[0] += m;
+            check_kinematics(&identity, &other)
+        };
+        assert!(longer(0.0).is_ok() && longer(0.029).is_ok());
+        let said = longer(0.031).unwrap_err().to_string();
+        assert!(said.contains("31 mm") && said.contains("arm.kinematics"), "{said}");
+        assert!(longer(f64::NAN).is_err());
     }
 }

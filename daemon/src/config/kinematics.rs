@@ -22,8 +22,8 @@ struct DhTable {
     theta: [f64; 6],
 }
 
-/// Reads an arm's Denavit-Hartenberg table: `[dh]` with `a`, `d` (m), `alpha`, `theta` (rad), six numbers each, and optionally the
-/// `model` that it belongs to.
+/// Reads an arm's Denavit-Hartenberg table: `[dh]` with `a`, `d` (m), `alpha`, `theta` (rad), six numbers each, and
+/// optionally the `model` that it belongs to.
 ///
 /// # Errors
 /// Names the file, the key and the fix; another model's table is refused.

@@ -28,7 +28,7 @@ pub enum Kinematics {
     /// The model's published values.
     Nominal,
     /// A file, read and held against the model.
-    File(PathBuf, Dh),
+    File(PathBuf, Box<Dh>),
 }
 
 /// A configuration in which every value is in range and every named file was read.
@@ -91,8 +91,8 @@ pub fn names(cell: &str, root: Option<&Path>) -> Result<Names, Failure> {
     .map_err(|e| Failure::input(e.to_string()))
 }
 
-/// The path from the root of the file system, without `..`. The last name is left as it is, be it a link or not yet there: whoever
-/// opens it judges it.
+/// The path from the root of the file system, without `..`. The last name is left as it is, be it a link or not yet
+/// there: whoever opens it judges it.
 fn full_path(path: &Path) -> std::io::Result<PathBuf> {
     let path = std::path::absolute(path)?;
     let Some(last) = path.file_name() else { return Ok(path) };
@@ -155,7 +155,7 @@ impl Config {
             "nominal" => Kinematics::Nominal,
             file => {
                 let file = folder.join(file);
-                let dh = load_kinematics(&file, model)?;
+                let dh = Box::new(load_kinematics(&file, model)?);
                 Kinematics::File(file, dh)
             }
         };

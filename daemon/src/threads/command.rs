@@ -88,7 +88,7 @@ impl<'a> CommandWorker<'a> {
         if self.link.is_none()
             && let Some(link) = self.shared.link_ready.take()
         {
-            self.status = LinkStatus { connected: true, token: link.token(), blocked_sends: 0 };
+            self.status = LinkStatus { connected: true, token: link.token(), ..LinkStatus::default() };
             self.link = Some(link);
         }
         if self.shared.drop_link.swap(false, Ordering::AcqRel) {
@@ -153,8 +153,10 @@ impl<'a> CommandWorker<'a> {
         self.packages = 0;
         let link = self.link.as_mut()?;
         match link.poll(now) {
-            LinkPoll { fault: None, state, packages, .. } => {
+            LinkPoll { fault: None, state, packages, missing, .. } => {
                 self.packages = packages;
+                self.status.states = self.status.states.wrapping_add(packages);
+                self.status.states_missing = self.status.states_missing.wrapping_add(missing);
                 state
             }
             LinkPoll { .. } => {

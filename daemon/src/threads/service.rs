@@ -18,7 +18,8 @@ use std::time::{Duration, Instant};
 
 /// Requests that start or allow motion are refused when older than this: a late message is not an operator's will any more.
 const MAX_AGE_NS: u64 = 250_000_000;
-/// One monotonic clock serves the whole host: a stamp later than this after now was not taken from it, and would never grow old.
+/// One monotonic clock serves the whole host: a stamp later than this after now was not taken from it, and would never
+/// grow old.
 const MAX_AHEAD_NS: u64 = 1_000_000;
 /// Images older than this are part of the answer to why the arm cannot be armed.
 const OLD_IMAGE_MS: f64 = 100.0;

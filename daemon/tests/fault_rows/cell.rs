@@ -149,7 +149,7 @@ impl Cell {
         };
         let now = now_ns();
         Cell {
-            status: LinkStatus { connected: true, token: link.token(), blocked_sends: 0 },
+            status: LinkStatus { connected: true, token: link.token(), ..LinkStatus::default() },
             server,
             link: Some(link),
             ended: None,
@@ -241,6 +241,8 @@ impl Cell {
             link.wait(now_ns() + 20 * MS);
         }
         let poll = link.poll(self.now);
+        self.status.states = self.status.states.wrapping_add(poll.packages);
+        self.status.states_missing = self.status.states_missing.wrapping_add(poll.missing);
         match poll.fault {
             None => poll.state,
             Some(fault) => {

@@ -65,7 +65,7 @@ fn link_rows() -> Vec<Row> {
         row("R08", "noise", Command::Garbage { port: RTDE, bytes: 4000 }, Fault(&["F-ARM-01", "F-ARM-02"], 24)),
         row("R08", "impossible length", Command::WrongLength { port: RTDE }, Fault(&["F-ARM-01"], 4)),
         row("R08", "unknown type", Command::UnknownType { port: RTDE }, Fault(&["F-ARM-01"], 4)),
-        row("R11", "one state of five", Command::KeepOneOf { n: 5 }, Arrives),
+        row("R11", "one state of five", Command::KeepOneOf { n: 5 }, Hold("H-15", 2_010)),
         row("R11", "one state of thirty", Command::KeepOneOf { n: 30 }, Fault(&["F-ARM-02"], 62)),
         row("R12", "clock restarts", Command::ClockRestart, Fault(&["F-ARM-01", "F-ARM-13"], 4)),
         row("R12", "clock goes back", Command::ClockShift { seconds: -1.0 }, Fault(&["F-ARM-01", "F-ARM-13"], 4)),
@@ -372,8 +372,8 @@ fn a_link_that_ends_says_why() {
     }
 }
 
-/// Kinematics that are not the arm's make the gripper's speed cap another than its figure: the controller's own word on its tool
-/// point says so, wherever that point is. A controller that does not say it is driven all the same.
+/// Kinematics that are not the arm's make the gripper's speed cap another than its figure: the controller's own word on
+/// its tool point says so, wherever that point is. A controller that does not say it is driven all the same.
 #[test]
 fn kinematics_that_are_not_the_arms_are_noticed_by_the_controllers_own_speed() {
     let tool = Command::Tcp { pose: [0.02, -0.03, 0.17, 0.1, 0.2, -0.3] };

@@ -5,7 +5,8 @@ use crate::geom::{Pose, Vec3};
 use nalgebra::{Matrix6, Vector6};
 
 impl Dh {
-    /// Speed (m/s) of the point at `offset` in the flange's frame (m and rotation vector, as UR writes it) at joint rates `qd`.
+    /// Speed (m/s) of the point at `offset` in the flange's frame (m and rotation vector, as UR writes it) at joint
+    /// rates `qd`.
     pub fn tool_speed(&self, q: &Joints, qd: &Joints, offset: &[f64; 6]) -> f64 {
         let xi = self.body_jacobian(q, &pose_from_ur(offset)) * Vector6::from_column_slice(qd);
         crate::math::sqrt(xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2])

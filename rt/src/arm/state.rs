@@ -57,7 +57,7 @@ impl RobotState {
     /// The outputs as the control script numbers them: 0 to 7 the controller's, 8 and 9 the tool's.
     pub fn output_levels(&self) -> u32 {
         // On the wire the configurable outputs lie between the two.
-        (self.digital_outputs & 0xff) as u32 | (self.digital_outputs >> 16 & 0b11) as u32 * 0x100
+        (self.digital_outputs & 0xff | (self.digital_outputs >> 16 & 0b11) << 8) as u32
     }
 }
 

@@ -29,7 +29,8 @@ impl Grip {
     }
 }
 
-/// How long after a command the outputs may still show the one before, ns: the way to the script and back, at 125 Hz three steps each.
+/// How long after a command the outputs may still show the one before, ns: the way to the script and back, at 125 Hz
+/// three steps each.
 const SETTLE_NS: u64 = 100_000_000;
 
 /// What was told and what was seen.
@@ -64,7 +65,8 @@ impl Fingers {
         self.grip
     }
 
-    /// Whether the arm would pull at what the gripper holds, as far as anybody knows. Without outputs only what was told counts.
+    /// Whether the arm would pull at what the gripper holds, as far as anybody knows. Without outputs only what was
+    /// told counts.
     pub(super) fn may_hold(&self) -> bool {
         match self.grip {
             Grip::None => self.told.is_some_and(|(close, _)| close),
@@ -94,8 +96,9 @@ impl TaskSettings {
     }
 }
 
-/// Whether closing and opening cannot be told apart by the outputs: no output that both set is set differently. Such a gripper
-/// would be "opened" by what closes it, and nobody could read back what it holds. Words are mask and values, 16 bits each.
+/// Whether closing and opening cannot be told apart by the outputs: no output that both set is set differently. Such a
+/// gripper would be "opened" by what closes it, and nobody could read back what it holds. Words are mask and values, 16
+/// bits each.
 pub const fn same_words(close: u32, open: u32) -> bool {
     let both = close >> 16 & open >> 16;
     close >> 16 != 0 && open >> 16 != 0 && (close ^ open) & both == 0

@@ -17,6 +17,10 @@ pub struct LinkStatus {
     pub token: i32,
     /// Set-points in a row that could not be sent.
     pub blocked_sends: u32,
+    /// State packages of this session that came, and those that the controller left out by its own clock; both wrap.
+    pub states: u32,
+    /// See `states`.
+    pub states_missing: u32,
 }
 
 /// What an operator can ask for.

@@ -289,6 +289,9 @@ impl CommandCycle {
         if limit > 0 && missed_lately > limit {
             return Some(HoldCause::Overruns { count: missed_lately });
         }
+        if let Some(share) = self.arm.thin() {
+            return Some(HoldCause::StatesMissing { share });
+        }
         if self.arm.slider() < 0.01 {
             return Some(HoldCause::SliderZero);
         }
@@ -362,6 +365,9 @@ impl CommandCycle {
         self.may_arm(now)?;
         if self.fingers.may_hold() {
             return Err(Reject::GripperClosed);
+        }
+        if self.arm.thin().is_some() {
+            return Err(Reject::StatesMissing);
         }
         let good = self.config.settings.watch.good_ns;
         let (arm, vision) = (self.arm.good_for_ns(now), self.vision.good_for_ns(now));

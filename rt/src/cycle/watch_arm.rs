@@ -20,6 +20,35 @@ mod bit {
     pub(super) const STOPPED: u32 = 1 << 10;
 }
 
+/// States that came and states that did not, over the last whole second.
+#[derive(Clone, Copy, Debug)]
+struct Thin {
+    since_ns: u64,
+    /// Counts at the beginning of the second.
+    begin: [u32; 2],
+    /// Share that came in the second before.
+    share: f64,
+}
+
+impl Default for Thin {
+    fn default() -> Self {
+        Self { since_ns: 0, begin: [0; 2], share: 1.0 }
+    }
+}
+
+impl Thin {
+    fn note(&mut self, now_ns: u64, link: &LinkStatus) {
+        if now_ns.saturating_sub(self.since_ns) < 1_000_000_000 {
+            return;
+        }
+        let counts = [link.states, link.states_missing];
+        let [came, missing] = core::array::from_fn(|i| counts[i].wrapping_sub(self.begin[i]));
+        let all = came.saturating_add(missing);
+        self.share = if all == 0 { 1.0 } else { f64::from(came) / f64::from(all) };
+        (self.since_ns, self.begin) = (now_ns, counts);
+    }
+}
+
 /// The robot as known now.
 #[derive(Clone, Debug)]
 pub(super) struct ArmWatch {
@@ -28,6 +57,7 @@ pub(super) struct ArmWatch {
     link: LinkStatus,
     echo_changed_ns: u64,
     blocked_since_ns: Option<u64>,
+    thin: Thin,
     /// What the last state showed that a later one does not: a jump, a clock that went back.
     event: Option<FaultCause>,
     event_ns: u64,
@@ -51,6 +81,7 @@ impl ArmWatch {
             link: LinkStatus::default(),
             echo_changed_ns: 0,
             blocked_since_ns: None,
+            thin: Thin::default(),
             event: None,
             event_ns: 0,
             sent: [(0, [0.0; 6]); SENT],
@@ -71,7 +102,9 @@ impl ArmWatch {
             // A new connection: the controller may have been restarted, nothing old is comparable.
             self.state = None;
             self.echo_changed_ns = now_ns;
+            self.thin = Thin { since_ns: now_ns, begin: [link.states, link.states_missing], share: 1.0 };
         }
+        self.thin.note(now_ns, &link);
         self.link = link;
         self.blocked_since_ns = match (link.blocked_sends, self.blocked_since_ns) {
             (0, _) => None,
@@ -159,8 +192,8 @@ impl ArmWatch {
         self.creeping_since_ns = if resting && creeping { self.creeping_since_ns.or(Some(now_ns)) } else { None };
     }
 
-    /// Compares the controller's speed of its tool point with `ours` for the same point, by our kinematics: they differ where the
-    /// kinematics do, and then the gripper's speed cap is another than its figure.
+    /// Compares the controller's speed of its tool point with `ours` for the same point, by our kinematics: they differ
+    /// where the kinematics do, and then the gripper's speed cap is another than its figure.
     pub(super) fn compare_tool(&mut self, now_ns: u64, tool: Option<(ToolPoint, f64)>) {
         let Some((point, ours)) = tool else {
             self.tool_off_since_ns = None;
@@ -188,6 +221,11 @@ impl ArmWatch {
     /// The newest usable state.
     pub(super) fn state(&self) -> Option<&RobotState> {
         self.state.as_ref()
+    }
+
+    /// Share of the controller's states that came, where it is less than it must be.
+    pub(super) fn thin(&self) -> Option<f64> {
+        (self.thin.share < self.settings.state_share).then_some(self.thin.share)
     }
 
     /// Whether there was a link in the last beat.

@@ -220,7 +220,20 @@ impl VisionWatch {
             (limit - age) as f64 / (limit - hold) as f64
         };
         let degraded = self.seen.is_some_and(|s| s.vision.status == VisionStatus::Degraded);
-        if degraded { 0.5 * by_age } else { by_age }
+        if degraded || self.few_marks() { 0.5 * by_age } else { by_age }
+    }
+
+    /// Whether the loss of one mark more would hold the arm (M01): one point of it in each view in use.
+    fn few_marks(&self) -> bool {
+        let Some(seen) = &self.seen else { return false };
+        let [left, right] = seen.vision.marks.each_ref().map(|view| view.iter().flatten().count());
+        let (points, spare) = match self.law.views {
+            ViewMode::Stereo => (left + right, 2),
+            ViewMode::Left => (left, 1),
+            ViewMode::Right => (right, 1),
+            ViewMode::Best => (left.max(right), 1),
+        };
+        points < usize::from(self.law.min_points) + spare
     }
 
     /// Whether there is a fresh result to start from.

@@ -14,12 +14,13 @@ pub mod ceiling {
 
 /// The longest and widest stop that a configuration may make of its limits, from full speed.
 pub mod stop_bound {
-    /// Time until the rates sent are zero, seconds: twice what the default limits need, which leaves a signal's whole second for it.
+    /// Time until the rates sent are zero, seconds: twice what the default limits need, which leaves a signal's whole
+    /// second for it.
     pub const TIME_S: f64 = 0.3;
     /// Way of the fastest joint, rad (8.6 degrees): five times what the default limits need.
     pub const JOINT_RAD: f64 = 0.15;
-    /// Way of the gripper's origin, m: what fingers and the part before them may be off by without being crushed is less, so that a
-    /// wider stop is no stop for this task. Three times what the default limits need.
+    /// Way of the gripper's origin, m: three times what the default limits need, and less than the shortest default
+    /// standoff (80 mm), so that a stop begun at the pre-grasp ends before the part.
     pub const TCP_M: f64 = 0.05;
 }
 
@@ -158,8 +159,9 @@ impl Limits {
         Ok(limits)
     }
 
-    /// The guard's own stop from full speed, to the beat: the rates shrink by A T a beat, N beats long, and the mean over the last n
-    /// beats, which begins full of the old rates, follows it by (n - 1) / 2 beats and ends n - 1 beats later.
+    /// The guard's own stop from full speed, to the beat: the rates shrink by A T a beat, N beats long, and the mean
+    /// over the last n beats, which begins full of the old rates, follows it by (n - 1) / 2 beats and ends n - 1 beats
+    /// later.
     pub fn stop_figures(&self) -> StopFigures {
         let fastest = self.velocity.iter().fold(0.0_f64, |m, v| m.max(*v));
         let (step, lag) = (self.acceleration * self.period_s, self.filter as f64 - 1.0);

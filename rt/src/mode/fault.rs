@@ -295,6 +295,11 @@ pub enum HoldCause {
     },
     /// H-11: the law found no finite solution in this beat.
     NoSolution,
+    /// H-15: the controller leaves out too many of its states (R11).
+    StatesMissing {
+        /// Share that came in the last second, 0 to 1.
+        share: f64,
+    },
     /// H-02: the marks seen do not fix the motion (B12).
     Geometry {
         /// Smallest singular value, px/m.
@@ -349,6 +354,7 @@ impl HoldCause {
             HoldCause::MarksLost => "H-01",
             HoldCause::FewPoints { .. } => "H-10",
             HoldCause::NoSolution => "H-11",
+            HoldCause::StatesMissing { .. } => "H-15",
             HoldCause::Geometry { .. } => "H-02",
             HoldCause::Singular { .. } => "H-03",
             HoldCause::JointEnd { .. } => "H-04",
@@ -378,6 +384,11 @@ impl fmt::Display for HoldCause {
             HoldCause::NoSolution => {
                 write!(f, "the law found no finite solution: stop, and look at rig and gripper files")
             }
+            HoldCause::StatesMissing { share } => write!(
+                f,
+                "only {:.0} % of the controller's states came within a second: look at its load and at the network",
+                share * 100.0
+            ),
             HoldCause::Geometry { sigma_min, condition } => write!(
                 f,
                 "the marks seen do not fix the motion (sigma {sigma_min:.1} px/m, condition {condition:.0}): show more marks"
@@ -428,6 +439,8 @@ pub enum Reject {
     CameraMoved,
     /// Both views are to be used and one shows too few marks.
     OneView,
+    /// The controller leaves out too many of its states.
+    StatesMissing,
     /// The gripper is closed on something: open it before the arm may leave.
     GripperClosed,
 }
@@ -454,6 +467,9 @@ impl Reject {
             }
             Reject::GripperClosed => {
                 "the gripper is closed on something, or its outputs do not show that it is open: open it first"
+            }
+            Reject::StatesMissing => {
+                "the controller leaves out too many of its states: look at its load and at the network"
             }
             Reject::BadValue => "a value of the request is out of range",
         }

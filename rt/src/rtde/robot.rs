@@ -5,7 +5,8 @@ use super::recipe::{Recipe, Slot};
 use super::value::Wire;
 use crate::arm::{ArmCommand, ArmMode, Joints, RobotState, ToolPoint};
 
-/// How many of [`STATE_FIELDS`] every controller has; the others came with later software, and a session does without them.
+/// How many of [`STATE_FIELDS`] every controller has; the others came with later software, and a session does without
+/// them.
 pub const NEEDED_FIELDS: usize = 17;
 
 /// Output variables of the control session.

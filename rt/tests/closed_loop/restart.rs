@@ -1,8 +1,9 @@
-//! What a loop must know that has just begun: what the gripper holds, and whether the arm's kinematics are the controller's.
+//! What a loop must know that has just begun: what the gripper holds, and whether the arm's kinematics are the
+//! controller's.
 
 use super::converge;
-use super::world::World;
-use graspd_rt::cycle::{CommandCycle, Grip, RequestKind};
+use super::world::{MS, World};
+use graspd_rt::cycle::{CommandCycle, Grip, RequestKind, Why};
 use graspd_rt::mode::{ModeName, Reject};
 
 /// A converged world whose gripper has been closed, and whose loop has been started afresh.
@@ -99,4 +100,52 @@ fn nothing_measured_is_no_zero() {
     w.start();
     let r = w.run(200).record;
     assert!(r.left_from_gripper.is_some() && r.error_px.is_finite() && r.residual_px.is_finite());
+}
+
+/// R11: the controller's states come thin. Both sides of the share that holds, which is noticed within two seconds.
+#[test]
+fn thin_states_hold_the_arm() {
+    for (one_of, share, held) in [(1, 0.8, false), (4, 0.8, true), (4, 0.24, false)] {
+        let mut w = World::new(4, |s| s.watch.state_share = share);
+        w.start();
+        w.run(100);
+        let begun = w.now;
+        w.one_of = one_of;
+        let mut cause = None;
+        while w.now < begun + 2_000 * MS && cause.is_none() && w.cycle.mode().drives() {
+            let out = w.beat(None, false);
+            cause = out.event.and_then(|e| match e.why {
+                Why::Hold(c) => Some(c.code()),
+                _ => None,
+            });
+        }
+        assert_eq!(cause, held.then_some("H-15"), "one of {one_of}, share {share}");
+        if held {
+            w.run(500);
+            assert_eq!(w.cycle.mode().name(), ModeName::Armed);
+            assert_eq!(ask(&mut w, RequestKind::Servo), Err(Reject::StatesMissing));
+            w.one_of = 1;
+            w.run(2_100);
+            assert_eq!(ask(&mut w, RequestKind::Servo), Ok(()));
+        }
+        w.judge_wire();
+    }
+}
+
+/// M01: where one mark more would hold the arm it goes at half its speed; with one to spare it does not.
+#[test]
+fn few_marks_slow_the_arm_down() {
+    let top = |min_points: u8| {
+        let mut w = World::new(4, |s| s.law.min_points = min_points);
+        w.start();
+        let mut top = 0.0_f64;
+        for _ in 0..1_000 {
+            top = top.max(w.beat(None, false).record.scale);
+        }
+        assert!(w.cycle.mode().drives());
+        top
+    };
+    // Eight marks in two views.
+    assert!(top(14) > 0.9, "{}", top(14));
+    assert!(top(15) <= 0.5 && top(15) > 0.3, "{}", top(15));
 }

@@ -105,6 +105,9 @@ pub(crate) struct World {
     pending: ArmCommand,
     pub(crate) sent: Vec<(u64, Joints)>,
     pub(crate) outputs: u32,
+    /// States that came, and those that the controller left out; of how many one comes.
+    states: [u32; 2],
+    pub(crate) one_of: u32,
     /// `actual_digital_output_bits`.
     pub(crate) levels: u64,
     /// The controller tells its tool point's speed, this many times the true one.
@@ -195,6 +198,8 @@ impl World {
             pending: ArmCommand::default(),
             sent: Vec::new(),
             outputs: 0,
+            states: [0; 2],
+            one_of: 1,
             // Begins with an open gripper.
             levels: wire(u64::from(open & 0xffff)),
             tool: None,
@@ -446,6 +451,9 @@ impl World {
         }
         let beat = self.pending.beat;
         let state = self.state(beat);
+        // One state a beat comes; what lies between two of them counts as left out.
+        self.states[0] += 1;
+        self.states[1] += self.one_of - 1;
         let before = std::time::Instant::now();
         let heap = crate::heap::calls();
         let output = self.cycle.step(&CommandInput {
@@ -455,6 +463,8 @@ impl World {
                 connected: !self.faults.link_down,
                 token: 42,
                 blocked_sends: u32::from(self.faults.blocked),
+                states: self.states[0],
+                states_missing: self.states[1],
             },
             vision: vision.as_ref(),
             request: request.map(|kind| Request { id: 1, kind }),

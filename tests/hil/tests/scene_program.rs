@@ -184,7 +184,7 @@ fn rows_of_numbers_are_taken_in_the_form_of_the_help() {
     let out = make("wrong", &["--rig-error", "0.5,0.1", "--kinematics-error", "0.5,0.1"]);
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
     let read = |to: &str, file: &str| std::fs::read_to_string(dir.join(to).join(file)).unwrap();
-    for file in ["rig.toml", "arm.toml"] {
+    for file in ["rig.toml", "true_arm.toml"] {
         assert_ne!(read("plain", file), read("wrong", file), "{file}");
     }
     assert_eq!(read("plain", "true_rig.toml"), read("wrong", "true_rig.toml"));

@@ -54,12 +54,6 @@ impl BarFound {
         self.kept().0
     }
 
-    /// What speaks against it: noise in units of the edges' own, for the part of its outlines that is seen.
-    pub(in crate::offline) fn doubt(&self) -> f64 {
-        let seen: f64 = self.outer.iter().chain(&self.inner).map(|c| c.coverage).sum::<f64>() / 4.0;
-        self.reconstruction.report.noise / seen.max(1e-3)
-    }
-
     /// All points of a view, the outer outline first.
     pub(in crate::offline) fn points(&self, view: usize) -> Vec<EdgePoint> {
         let mut all = self.outer.get(view).map(|c| c.edge_points(Outline::Outer)).unwrap_or_default();

@@ -22,61 +22,39 @@ pub const PARAMETERS: usize = 12;
 /// difference, principal point left (2) and right (2).
 pub type Phi = SVector<f64, PARAMETERS>;
 
-/// Standard deviations of what a rig file may have wrong.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RigPrior {
-    /// Rotation of the right camera against the left about each axis, radians.
-    pub rotation_rad: f64,
-    /// Place of the right camera along each axis, as a fraction of the baseline.
-    pub place: f64,
-    /// Both focal lengths together, relative.
-    pub focal: f64,
-    /// Their difference, relative.
-    pub focal_difference: f64,
-    /// Each coordinate of each principal point, pixels.
-    pub principal_px: f64,
-}
-
-impl Default for RigPrior {
-    /// A rig that nobody has stated the quality of: calibrated once with care, then lived with.
-    fn default() -> Self {
-        Self {
-            rotation_rad: 0.1_f64.to_radians(),
-            place: 2e-3,
-            focal: 5e-3,
-            focal_difference: 1e-3,
-            principal_px: 1.0,
-        }
-    }
-}
+/// Standard deviations of what a rig file may have wrong: the rig's stated quality, or the default of [`graspd_rt::geom::RigError`].
+///
+/// The right camera may also stand elsewhere, along each axis by as large a part of the baseline as its rotation is off in radians: the
+/// baseline's direction is known no better than the cameras' own.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RigPrior(pub graspd_rt::geom::RigError);
 
 impl RigPrior {
-    /// The same shape of error, larger or smaller by a factor. Zero trusts the rig file.
-    pub fn scaled(self, factor: f64) -> Self {
-        Self {
-            rotation_rad: self.rotation_rad * factor,
-            place: self.place * factor,
-            focal: self.focal * factor,
-            focal_difference: self.focal_difference * factor,
-            principal_px: self.principal_px * factor,
-        }
+    /// The same shape of error, scaled so that it displaces epipolar lines by `px` pixels (one standard deviation). Zero trusts the rig file.
+    pub fn displacing(self, rig: &Rig, px: f64) -> Self {
+        let own = RigError::prior(rig, &self).unknown_px();
+        Self(self.0.scaled(if own > 0.0 { px / own } else { 0.0 }))
+    }
+
+    fn none() -> Self {
+        Self(graspd_rt::geom::RigError::default().scaled(0.0))
     }
 
     /// The rig with an error of so many standard deviations put right.
     fn corrected(&self, rig: &Rig, phi: &Phi) -> Rig {
         let mut out = *rig;
-        let turn = Vector3::new(phi[0], phi[1], phi[2]) * self.rotation_rad;
+        let turn = Vector3::new(phi[0], phi[1], phi[2]) * self.0.rotation_rad;
         out.right_from_left.rotation = UnitQuaternion::from_scaled_axis(turn) * rig.right_from_left.rotation;
         let baseline = rig.right_from_left.translation.vector.norm();
         // Turned about the right camera's own centre, which then moves.
-        let centre = rig.centre(View::Right) + Vector3::new(phi[3], phi[4], phi[5]) * (self.place * baseline);
+        let centre = rig.centre(View::Right) + Vector3::new(phi[3], phi[4], phi[5]) * (self.0.rotation_rad * baseline);
         out.right_from_left.translation.vector = -(out.right_from_left.rotation * centre);
-        let (common, half) = (self.focal * phi[6], 0.5 * self.focal_difference * phi[7]);
-        for (camera, scale, at) in [(&mut out.left, common + half, 8), (&mut out.right, common - half, 10)] {
+        let (common, half) = (self.0.focal * phi[6], self.0.focal_difference * phi[7]);
+        for (camera, scale, at) in [(&mut out.left, common - half, 8), (&mut out.right, common + half, 10)] {
             camera.fx *= 1.0 + scale;
             camera.fy *= 1.0 + scale;
-            camera.cx += self.principal_px * phi[at];
-            camera.cy += self.principal_px * phi[at + 1];
+            camera.cx += self.0.principal_px * phi[at];
+            camera.cy += self.0.principal_px * phi[at + 1];
         }
         out
     }
@@ -131,7 +109,9 @@ const QUALITIES: [f64; 10] = [0.03, 0.045, 0.065, 0.1, 0.15, 0.22, 0.33, 0.5, 0.
 /// Widths of the redescending loss, pixels, from one that holds every rig of the prior to one of a few standard deviations of a match.
 const WIDTHS: [f64; 6] = [8.0, 4.0, 2.0, 1.2, 0.8, 0.6];
 /// Scatters of right matches across their lines that are weighed, pixels: patches of a clean image, of a blurred or compressed one.
-const SCATTERS_PX: [f64; 3] = [0.07, 0.15, 0.3];
+const SCATTERS_PX: [f64; 3] = [0.1, 0.2, 0.4];
+/// Weight of a match: spots come in groups that see one edge or one occlusion and are off together, so that two count as one.
+const WEIGHT: f64 = 0.5;
 /// Part of the matches that is false beforehand.
 const FALSE: f64 = 0.5;
 /// A false match lies anywhere within so many pixels across its line: as far as the search climbs.
@@ -143,7 +123,7 @@ impl RigError {
     /// A rig file believed to the letter.
     pub fn none(rig: &Rig) -> Self {
         let p = View::BOTH.map(|v| projection(rig, v));
-        let prior = RigPrior::default().scaled(0.0);
+        let prior = RigPrior::none();
         Self { rig: *rig, p, modes: Vec::new(), parts: Vec::new(), prior, seen: Seen::default() }
     }
 
@@ -215,7 +195,7 @@ impl RigError {
             let sum: f64 = slopes.iter().map(|s| s.norm_squared()).sum();
             (sum / slopes.len().max(1) as f64).sqrt()
         };
-        if prior.scaled(0.0) == *prior || matches.len() < LEAST_AGREEING {
+        if *prior == RigPrior::none() || matches.len() < LEAST_AGREEING {
             return Self { seen, ..Self::prior(rig, prior) };
         }
         let mut phi = Phi::zeros();
@@ -401,8 +381,8 @@ fn robust(
             let s = scatter.hypot(*sigma);
             let t = (r0 + j.dot(&at)) / s;
             let right = (1.0 - FALSE) / (s * root) * (-0.5 * t * t).exp();
-            log += (right + false_density).ln();
-            let w = right / (right + false_density) / (s * s);
+            log += WEIGHT * (right + false_density).ln();
+            let w = WEIGHT * right / (right + false_density) / (s * s);
             if w > 1e-9 {
                 n += j * j.transpose() * w;
                 b -= j * (r0 * w);

@@ -36,15 +36,18 @@ const WAVE_SPREAD: f64 = 0.7;
 const NOISE_BELIEF: f64 = 6.0;
 /// A point farther from the outline than this, in its own standard deviations, is somebody else's and costs as much.
 pub(in crate::offline) const OUTLIER_SIGMAS: f64 = 4.5;
-/// Gauss-Newton rounds.
-const ROUNDS: usize = 4;
+/// Gauss-Newton rounds at most, and the step, in standard deviations of the answer, from which it has converged.
+const ROUNDS: usize = 14;
+const CONVERGED: f64 = 0.05;
 /// Usual radius of a bar as a fraction of its ring's, and how far bars differ from it, as a natural logarithm: hand wheels, handles and pipes lie
 /// between a thirtieth and a half.
 const USUAL_BAR: f64 = 0.12;
 const BAR_SPREAD: f64 = 0.6;
 /// How far the second edge of a flat ring lies from coaxial with the first: across and along the axis as a fraction of the radius, and in direction,
 /// radians.
-const COAXIAL: [f64; 3] = [0.02, 0.1, 0.02];
+const COAXIAL: [f64; 3] = [0.005, 0.05, 0.005];
+/// How far the radius of the second edge differs from the first, as a fraction of it: what a bar's diameter may be.
+const RING_WIDTH: f64 = 0.15;
 /// Parameters of a shape at most.
 const SHAPE: usize = 8;
 
@@ -259,10 +262,16 @@ struct Solved {
     step: DVector<f64>,
     inverse: DMatrix<f64>,
     chi2: f64,
-    free: f64,
     log_evidence: f64,
     kappa: f64,
     wave_px: f64,
+}
+
+impl Solved {
+    /// Size of the step of shapes and rig in standard deviations.
+    fn size(&self, waves: usize) -> f64 {
+        (0..waves).map(|k| self.step[k].abs() / self.inverse[(k, k)].sqrt()).fold(0.0, f64::max)
+    }
 }
 
 /// Fits a hypothesis to contours. `None` where it leads nowhere (a shape collapses, a point has no residual).
@@ -274,10 +283,11 @@ pub(in crate::offline) fn fit(hypothesis: &Hypothesis, stretches: &[Stretch], ri
         let linear = Linear::new(hypothesis, &shapes, &phi, stretches, rig)?;
         let used = linear.used(noise, round);
         let sums = linear.sums(&used);
-        let solved = if round + 1 == ROUNDS { linear.best_noise(&sums) } else { linear.solve(&sums, noise.1, noise.0) }?;
+        let solved = linear.solve(&sums, noise.1, noise.0)?;
         noise = (solved.kappa, solved.wave_px);
-        if round + 1 == ROUNDS {
-            return Some(linear.result(shapes, phi, &solved, &sums, &used));
+        if round >= 2 && solved.size(linear.waves) < CONVERGED {
+            let best = linear.best_noise(&sums)?;
+            return Some(linear.result(shapes, phi, &best, &sums, &used));
         }
         linear.advance(&mut shapes, &solved.step)?;
         for (k, v) in phi.iter_mut().enumerate() {
@@ -392,6 +402,14 @@ impl Linear {
             }
         }
         self.coaxial = sd;
+        // Radius and shape follow the first edge's within the width of a ring.
+        let narrow = RING_WIDTH * size / self.unit[at + 5];
+        if narrow < 1.0 {
+            for i in first..first + points {
+                self.columns[(i, at + 5)] *= narrow;
+            }
+            self.unit[at + 5] *= narrow;
+        }
         for k in 0..5 {
             self.offset[at + k] = off[k] / sd[k];
         }
@@ -533,7 +551,7 @@ impl Linear {
             let log_waves: f64 = (self.waves..width).map(|_| -wave_px.ln()).sum();
             let log_evidence =
                 -0.5 * (chi2 + lost) - 0.5 * log_det + log_waves - sums.count as f64 * kappa.ln() + log_prior;
-            best = Some(Solved { step, inverse, chi2, free, log_evidence, kappa, wave_px });
+            best = Some(Solved { step, inverse, chi2, log_evidence, kappa, wave_px });
             let next = ((data.max(0.0) + NOISE_BELIEF) / (free + NOISE_BELIEF)).sqrt();
             if (next / kappa - 1.0).abs() < 0.02 {
                 break;

@@ -69,15 +69,14 @@ const BAR_PAIRS: usize = 8;
 const OTHER_OUTLINE_PLACES: f64 = 16.0;
 /// Part of a bar's other outline that carries edges: hub, spokes and what stands before it hide the rest.
 const OTHER_OUTLINE_SEEN: f64 = 0.75;
-/// Logarithm of the probability that a bar's outlines cannot be followed although they are there: 18 of 400 rendered bare wheels.
-const LOG_NOT_FOLLOWED: f64 = -3.1;
+/// Logarithm of the probability that a bar's outlines cannot be followed although they are there: 6 of 400 rendered bare wheels.
+const LOG_NOT_FOLLOWED: f64 = -4.2;
 /// Smooth edge error up to which a circle is a clean one, pixels: what edges on their own have.
 const CLEAN_PX: f64 = 0.1;
 
 /// Two contours with their plane models.
-struct Judged<'a> {
+struct Judged {
     contours: [Contour; 2],
-    clicked: [&'a Contour; 2],
     analysis: Analysis,
     models: Vec<Weighed>,
     score: f64,
@@ -85,7 +84,7 @@ struct Judged<'a> {
     tried: usize,
 }
 
-impl Judged<'_> {
+impl Judged {
     fn probability(&self, model: Model) -> f64 {
         let p = probabilities(&self.models.iter().map(|m| m.log).collect::<Vec<_>>());
         self.models.iter().zip(p).filter(|(m, _)| m.model == model).map(|(_, p)| p).sum()
@@ -134,18 +133,18 @@ fn score(model: RimModel, m: &Weighed) -> Score {
     Score { model, chi2: f.chi2, parameters: f.parameters, bic: -2.0 * m.log, excluded: None }
 }
 
-fn judge<'a>(
+fn judge(
     views: [&ViewEdges<'_>; 2],
-    clicked: [&'a Contour; 2],
+    clicked: [&Contour; 2],
     (cost, tried): (f64, usize),
     rig: &RigError,
     options: &Options,
-) -> Result<Judged<'a>, Refusal> {
+) -> Result<Judged, Refusal> {
     let contours = told_apart(views, clicked);
     let points = [0, 1].map(|k| contours[k].edge_points(Outline::Outer));
     let analysis = analyse([&points[0], &points[1]], [&rig.p[0], &rig.p[1]], options)?;
     let models = plane_models([&contours[0], &contours[1]], &analysis, options.rim, rig);
-    let mut out = Judged { contours, clicked, analysis, models, score: 0.0, cost, tried };
+    let mut out = Judged { contours, analysis, models, score: 0.0, cost, tried };
     if out.best().is_none() {
         return Err(out.analysis.no_rim());
     }
@@ -162,7 +161,7 @@ pub fn pair(
 ) -> Result<Pair, Unpaired> {
     let order = in_order(candidates);
     let mut first: Option<Refusal> = None;
-    let mut accepted: Vec<Judged<'_>> = Vec::new();
+    let mut accepted: Vec<Judged> = Vec::new();
     for (tried, (cost, l, r)) in order.iter().enumerate() {
         let enough = accepted.iter().map(|a| a.cost).reduce(f64::min).is_some_and(|c| *cost > c + FARTHER_PX);
         if accepted.len() >= COMPARED || enough {
@@ -210,7 +209,7 @@ fn in_order<'a>(candidates: [&'a [Candidate]; 2]) -> Ordered<'a> {
 fn bar_or_plane(
     views: [&ViewEdges<'_>; 2],
     order: &Ordered<'_>,
-    best: Option<Judged<'_>>,
+    best: Option<Judged>,
     rig: &RigError,
     options: &Options,
 ) -> Result<Option<Pair>, Refusal> {
@@ -276,7 +275,7 @@ fn look_for_bars(
     clicked: [&Contour; 2],
     rig: &RigError,
     options: &Options,
-    best: Option<&Judged<'_>>,
+    best: Option<&Judged>,
 ) -> Option<Bars> {
     let p = [&rig.p[0], &rig.p[1]];
     let points = [0, 1].map(|k| clicked[k].edge_points(Outline::Outer));
@@ -310,7 +309,7 @@ fn bar_pair(bar: FourOutlines, rig: &RigError) -> Result<Pair, Refusal> {
 }
 
 /// The plane rim, or the bar of which only the clicked outlines are seen, if one of both is out of the question.
-fn plane_pair(best: Judged<'_>, log_bar: f64, rig: &RigError, options: &Options) -> Result<Pair, Refusal> {
+fn plane_pair(best: Judged, log_bar: f64, rig: &RigError, options: &Options) -> Result<Pair, Refusal> {
     let chosen = best.best().ok_or(Refusal::NoFit { why: "no plane model fits" })?;
     if std::env::var("DBG").is_ok() {
         eprintln!("  seen {:?} unknown {:.3}", rig.seen, rig.unknown_px());
