@@ -3,7 +3,9 @@
 mod cycle;
 mod raw;
 mod settings;
+mod trust;
 
 pub use cycle::{cycle_config, load_kinematics};
 pub use raw::{RawArm, RawConfig, RawConverged, RawFiles, RawGripper, RawLimits, RawLoop, RawServo, RawShm, RawVision};
 pub use settings::{Config, Kinematics, LinkKind, names};
+pub use trust::{check_trust, names_of};

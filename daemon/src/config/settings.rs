@@ -65,6 +65,7 @@ impl Config {
     /// Names the file, the key, the value and the fix.
     pub fn load(path: &Path) -> Result<Self, Failure> {
         let shown = path.display();
+        super::check_trust(path)?;
         let text = std::fs::read_to_string(path).map_err(|e| {
             Failure::input(format!("{shown}: cannot be read ({e}); docs/CONFIG.md has an example to start from"))
         })?;
@@ -93,6 +94,9 @@ impl Config {
         let folder = path.parent().unwrap_or(Path::new("."));
         let names = names(&raw.cell, raw.shm.root.as_deref().map(|r| folder.join(r)).as_deref())
             .map_err(|e| Failure::input(format!("{shown}: {e}")))?;
+        for file in [&raw.files.rig, &raw.files.gripper] {
+            super::check_trust(&folder.join(file))?;
+        }
         let rig = RigFile::load(&folder.join(&raw.files.rig)).map_err(|e| Failure::input(e.to_string()))?;
         let gripper = GripperFile::load(&folder.join(&raw.files.gripper)).map_err(|e| Failure::input(e.to_string()))?;
         let link = match raw.arm.link.as_str() {
@@ -103,7 +107,10 @@ impl Config {
         let kinematics = match raw.arm.kinematics.as_str() {
             "controller" => Kinematics::Controller,
             "nominal" => Kinematics::Nominal,
-            file => Kinematics::File(folder.join(file)),
+            file => {
+                super::check_trust(&folder.join(file))?;
+                Kinematics::File(folder.join(file))
+            }
         };
         one_of(path, "arm.motion", &raw.arm.motion, &["velocity", "position"])?;
         one_of(path, "servo.views", &raw.servo.views, &["stereo", "left", "right", "best"])?;

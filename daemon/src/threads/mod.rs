@@ -23,7 +23,7 @@ pub use acquire::{AcquireReport, run as run_acquire};
 pub use command::CommandWorker;
 pub use refusal::Refusal;
 pub use report::Report;
-pub use service::Service;
+pub use service::{Service, ramp_limit};
 pub use shared::{JointSample, Seed, Shared, VisionCounters};
 pub use slot::Slot;
 pub use telemetry::{BeatRecord, fault_number, run as run_telemetry, why_words};

@@ -3,8 +3,12 @@
 use super::acquire::AcquireReport;
 use super::report::Report;
 use super::shared::Shared;
-use crate::config::Config;
+use crate::arm::{UrConfig, stop_script};
+use crate::config::{Config, LinkKind};
+use crate::links::ur_config;
+use crate::log;
 use crate::realtime::now_ns;
+use crate::stop::By;
 use graspd_calib::files::PlanFile;
 use graspd_rt::cycle::{Request as CycleRequest, RequestKind};
 use graspd_rt::mode::ModeName;
@@ -16,6 +20,8 @@ use std::time::{Duration, Instant};
 
 /// Requests that start or allow motion are refused when older than this: a late message is not an operator's will any more.
 const MAX_AGE_NS: u64 = 250_000_000;
+/// How long ending the control script may take; the arm rests already.
+const SCRIPT_END: Duration = Duration::from_millis(300);
 /// How long the command thread may take to answer: many beats.
 const ANSWER_WITHIN: Duration = Duration::from_millis(500);
 
@@ -43,7 +49,7 @@ impl Service<'_> {
         let result = match request.verb {
             Verb::Status => Ok(()),
             Verb::Stop => {
-                self.shared.stop_latch.store(true, Ordering::Release);
+                self.shared.live.stop(By::Verb);
                 Ok(())
             }
             Verb::Arm | Verb::Servo | Verb::Setpoint | Verb::Gripper if stale => {
@@ -60,7 +66,7 @@ impl Service<'_> {
             self.wait_for_the_ramp();
         }
         let reason = result.as_ref().err().map(String::as_str);
-        request.answer(result.is_ok(), &self.report.json(result.is_ok(), reason, &self.marks.text()));
+        request.answer(result.is_ok(), &self.report.json(result.is_ok(), reason, &self.marks.text(), &self.shared.live));
     }
 
     /// A refusal, and what is wrong with the robot if anything is.
@@ -74,7 +80,7 @@ impl Service<'_> {
     /// A stop is answered when its ramp has begun.
     fn wait_for_the_ramp(&self) {
         let until = Instant::now() + Duration::from_millis(100);
-        while Instant::now() < until && matches!(self.report.mode(), Some(ModeName::Servoing | ModeName::Converged)) {
+        while Instant::now() < until && matches!(self.shared.live.mode(), Some(ModeName::Servoing | ModeName::Converged)) {
             std::thread::sleep(Duration::from_millis(2));
         }
     }
@@ -139,18 +145,19 @@ impl Service<'_> {
     }
 
     fn recover(&self) -> Result<(), String> {
-        if matches!(self.report.mode(), Some(ModeName::Servoing | ModeName::Converged | ModeName::Stopping)) {
+        if matches!(self.shared.live.mode(), Some(ModeName::Servoing | ModeName::Converged | ModeName::Stopping)) {
             return Err("the arm is moving; stop first".to_owned());
         }
         self.recover.store(true, Ordering::Release);
         Ok(())
     }
 
-    /// Serves until `stop` is set by a signal, or a thread broke. Then the arm is ramped down before this returns.
-    pub fn serve(&self, server: &RequestServer, stop: &AtomicBool) {
+    /// Serves until the end is asked for, or a thread broke. Then the arm is ramped down before this returns.
+    pub fn serve(&self, server: &RequestServer) {
         let mut id = 1;
         let mut beats = (0, Instant::now());
-        while !stop.load(Ordering::Acquire) && !self.shared.broken.load(Ordering::Acquire) {
+        let mut failing = false;
+        while !self.shared.live.ending() && !self.shared.broken.load(Ordering::Acquire) {
             match server.next() {
                 Ok(Some(request)) => {
                     id += 1;
@@ -158,16 +165,18 @@ impl Service<'_> {
                 }
                 Ok(None) => std::thread::sleep(Duration::from_millis(2)),
                 Err(e) => {
-                    eprintln!("graspd: {e}");
+                    if !std::mem::replace(&mut failing, true) {
+                        log::say(&e);
+                    }
                     std::thread::sleep(Duration::from_millis(200));
                 }
             }
-            let now = self.shared.command_beat.load(Ordering::Relaxed);
+            let now = self.shared.live.beats();
             if now != beats.0 {
                 beats = (now, Instant::now());
             } else if beats.1.elapsed() > Duration::from_secs(2) {
-                eprintln!(
-                    "graspd: the command thread has stood still for 2 s; ending, so that the robot's own watchdog holds it stopped"
+                log::say(
+                    "the command thread has stood still for 2 s; ending, so that the robot's own watchdog holds it stopped",
                 );
                 self.shared.broken.store(true, Ordering::Release);
             }
@@ -175,13 +184,28 @@ impl Service<'_> {
         self.ramp_down();
     }
 
-    /// Stops the arm and waits until it rests, at most a second.
+    /// Stops the arm, waits until it rests, and ends the control script: the arm is then left to no watchdog.
     fn ramp_down(&self) {
-        self.shared.stop_latch.store(true, Ordering::Release);
-        let until = Instant::now() + Duration::from_millis(800);
-        std::thread::sleep(Duration::from_millis(30));
-        while Instant::now() < until && !self.report.at_rest() {
-            std::thread::sleep(Duration::from_millis(5));
+        let live = &self.shared.live;
+        live.stop(By::Ending);
+        // From here on every beat asks for a stop, also where no signal has asked for the end.
+        live.end.store(true, Ordering::Release);
+        let (from, until) = (live.beats(), Instant::now() + ramp_limit(self.config));
+        while Instant::now() < until && (live.moving() || live.beats() < from + 2) {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        if self.config.link == LinkKind::Rtde && live.linked() && !live.moving() {
+            let config = UrConfig { timeout: SCRIPT_END, ..ur_config(self.config) };
+            if let Err(e) = stop_script(&config) {
+                log::say(format_args!("the control script is left to the controller's watchdog: {e}"));
+            }
         }
     }
+}
+
+/// How long the arm may take to rest: twice the ramp from full speed within the configured limits.
+pub fn ramp_limit(config: &Config) -> Duration {
+    let l = &config.raw.limits;
+    let ramp_s = l.joint_speed_rad_s / l.joint_accel_rad_s2 + l.joint_accel_rad_s2 / l.joint_jerk_rad_s3;
+    Duration::from_secs_f64((2.0 * ramp_s).clamp(0.3, 5.0))
 }
