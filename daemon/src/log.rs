@@ -1,8 +1,9 @@
 //! The daemon's log: lines into a bounded queue, written by a thread of their own.
 //!
-//! Whoever logs pushes and goes on: a terminal that is stopped, a pipe that nobody reads, a full disk or a closed pipe hold up the log
-//! thread alone. What does not fit is dropped and counted; the count is in the status, in telemetry and, once writing goes on, in the
-//! log itself. Before [`start`] (the client commands never call it) a line goes straight to its stream.
+//! Whoever logs pushes and goes on: a terminal that is stopped, a pipe that nobody reads, a full disk or a closed pipe
+//! hold up the log thread alone. What does not fit is dropped and counted; the count is in the status, in telemetry
+//! and, once writing goes on, in the log itself. Before [`start`] (the client commands never call it) a line goes
+//! straight to its stream.
 
 use crate::realtime::now_ns;
 use crossbeam::queue::ArrayQueue;
@@ -109,7 +110,8 @@ pub fn lost() -> Lost {
     })
 }
 
-/// Waits until everything is written, at most `limit`: a process that ends takes its last words along unless its log is stuck.
+/// Waits until everything is written, at most `limit`: a process that ends takes its last words along unless its log is
+/// stuck.
 pub fn flush(limit: Duration) {
     let Some(log) = LOG.get() else { return };
     let until = Instant::now() + limit;
@@ -118,7 +120,8 @@ pub fn flush(limit: Duration) {
     }
 }
 
-/// Sends panics through the log: the standard hook writes to standard error on the thread that panicked, which may be a real-time one.
+/// Sends panics through the log: the standard hook writes to standard error on the thread that panicked, which may be a
+/// real-time one.
 pub fn take_panics() {
     std::panic::set_hook(Box::new(|info| {
         let thread = std::thread::current();
@@ -138,7 +141,8 @@ fn write_forever(log: &Log) {
             }
         }
         let lost = log.dropped.load(Ordering::Relaxed) + log.failed.load(Ordering::Relaxed);
-        if lost > told && put(Stream::Err, format!("graspd: {} log lines were lost\n", lost - told).as_bytes()).is_ok() {
+        if lost > told && put(Stream::Err, format!("graspd: {} log lines were lost\n", lost - told).as_bytes()).is_ok()
+        {
             told = lost;
         }
         log.writing_since_ns.store(0, Ordering::Release);
@@ -146,7 +150,8 @@ fn write_forever(log: &Log) {
     }
 }
 
-/// Writes all bytes, without the standard library's locks and buffers: a stuck write must not hold what the process's end needs.
+/// Writes all bytes, without the standard library's locks and buffers: a stuck write must not hold what the process's
+/// end needs.
 fn put(stream: Stream, bytes: &[u8]) -> Result<(), Errno> {
     match stream {
         Stream::Out => put_to(&std::io::stdout(), bytes),

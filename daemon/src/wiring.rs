@@ -4,10 +4,11 @@ use crate::config::{Config, Kinematics, LinkKind, cycle_config, load_kinematics}
 use crate::exit::{Exit, Failure};
 use crate::links::{LinkManager, ur_config};
 use crate::log;
-use crate::realtime::{RealtimeReport, ThreadSettings, enter, ignore_background_writes, lock_memory};
+use crate::realtime::{RealtimeReport, ThreadSettings, enter, lock_memory};
 use crate::stop::{Door, End, Live, catch_signals, serve};
 use crate::threads::{
-    AcquireReport, CommandWorker, Report, Service, Shared, VisionWorker, ramp_limit, run_acquire, run_telemetry,
+    AcquireReport, CommandWorker, Report, Service, Shared, VisionWorker, ramp_limit, run_acquire, run_damage,
+    run_telemetry,
 };
 use graspd_rt::arm::Dh;
 use graspd_rt::cycle::CommandCycle;
@@ -25,8 +26,6 @@ use std::time::Duration;
 /// A link that cannot be made at the start, a host that refuses real time where it is required, or a fault of our own.
 pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
     log::start().map_err(|e| Failure::link(format!("the log thread cannot be started ({e})")))?;
-    log::take_panics();
-    ignore_background_writes();
     let shared = Shared::default();
     catch_signals(&shared.live).map_err(|e| {
         Failure::link(format!("signals cannot be caught ({e}); the daemon would not stop the arm when it is ended"))
@@ -35,6 +34,7 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
     config.names.ensure_root(false).map_err(|e| Failure::link(e.to_string()))?;
     let mut door = Door::open(&config.names)?;
     start_stop_thread(config, &mut door, &shared.live)?;
+    let _over = Over(&shared.live);
     let node = create_node(&config.names, "graspd").map_err(|e| Failure::link(e.to_string()))?;
     let server = RequestServer::new(&node).map_err(|e| Failure::link(e.to_string()))?;
     let report = Report::default();
@@ -47,6 +47,7 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
     lock_memory(&mut host);
     let (host_in, host_out) = channel::<RealtimeReport>();
 
+    let door = &door;
     std::thread::scope(|scope| -> Result<Exit, Failure> {
         // However this scope is left, by a panic as well: its threads end, or it would wait for them for ever.
         let _end = EndOfThreads(&shared);
@@ -116,6 +117,12 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
                 let manager = LinkManager::new(config, &shared, &report, &recover);
                 spawn("link").spawn_scoped(scope, move || shared_ref.guarded("link", || manager.run()))
             })
+            .and_then(|_| {
+                let paths = door.paths();
+                spawn("damage").spawn_scoped(scope, move || {
+                    shared_ref.guarded("damage", || run_damage(node_ref, paths, shared_ref));
+                })
+            })
             .map(|_| ());
         if let Err(e) = started {
             return Err(Failure::link(format!(
@@ -152,13 +159,19 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
         let service =
             Service { config, config_path, shared: &shared, report: &report, marks: &marks, recover: &recover };
         shared.guarded("service", || service.serve(&server));
-        if shared.broken.load(Ordering::Acquire) {
-            return Err(Failure::fault(
-                "a thread of the daemon ended by itself; the arm was stopped; see the lines above",
-            ));
-        }
-        Ok(Exit::Done)
+        let verdict = verdict(&shared);
+        shared.live.settle(verdict.as_ref().map_or_else(|failure| failure.exit.code(), |exit| exit.code()));
+        verdict
     })
+}
+
+/// How an ordered end is reported.
+fn verdict(shared: &Shared) -> Result<Exit, Failure> {
+    if shared.broken.load(Ordering::Acquire) {
+        return Err(Failure::fault("a thread of the daemon ended by itself; the arm was stopped; see the lines above"));
+    }
+    // Said already; what remains is the exit code and the sentence at the end.
+    shared.damage.get().map_or(Ok(Exit::Done), |reason| Err(Failure::link(reason.clone())))
 }
 
 /// Ends the threads when it is dropped.
@@ -170,16 +183,27 @@ impl Drop for EndOfThreads<'_> {
     }
 }
 
-/// Beyond the ramp: ending the script, and threads that return from a connection. Who is not back by then is left behind.
+/// Lets the stop thread go when the daemon is over: what runs on in this process is not its business.
+struct Over<'a>(&'a Live);
+
+impl Drop for Over<'_> {
+    fn drop(&mut self) {
+        self.0.close();
+    }
+}
+
+/// Beyond the ramp: ending the script, and an answer that was being given.
 const END_NS: u64 = 3_000_000_000;
+/// For the threads when the arm rests: one that waits for a controller's answer is not waited for.
+const SETTLED_NS: u64 = 1_000_000_000;
 
 /// Starts the stop thread, which is not joined: it outlives everything else, because it is what ends a process that hangs.
 /// Its priority lies just below the command thread's: it must run while pictures are tracked, and does next to nothing.
 fn start_stop_thread(config: &Config, door: &mut Door, live: &Arc<Live>) -> Result<(), Failure> {
     let Some(listener) = door.listener() else { return Ok(()) };
     let priority = config.raw.beat.command_priority.saturating_sub(1).max(config.raw.beat.vision_priority);
-    let end =
-        End { after_ns: ramp_limit(config).as_nanos() as u64 + END_NS, code: Exit::Link.code() };
+    let after_ns = ramp_limit(config).as_nanos() as u64 + END_NS;
+    let end = End { after_ns, settled_ns: SETTLED_NS, code: Exit::Link.code() };
     let live = Arc::clone(live);
     std::thread::Builder::new()
         .name("stop".to_owned())
@@ -189,7 +213,9 @@ fn start_stop_thread(config: &Config, door: &mut Door, live: &Arc<Live>) -> Resu
             serve(&listener, &live, end);
         })
         .map(drop)
-        .map_err(|e| Failure::link(format!("the stop thread cannot be started ({e}); raise the process's thread limit")))
+        .map_err(|e| {
+            Failure::link(format!("the stop thread cannot be started ({e}); raise the process's thread limit"))
+        })
 }
 
 fn thread_settings(priority: u8, core: Option<usize>) -> ThreadSettings {
@@ -198,12 +224,7 @@ fn thread_settings(priority: u8, core: Option<usize>) -> ThreadSettings {
 
 /// The arm's kinematics by the configuration. With "controller" this waits until the controller answers, or the daemon is ended
 /// (`None`): nothing may be commanded with another arm's geometry.
-fn kinematics(
-    config: &Config,
-    report: &Report,
-    server: &RequestServer,
-    live: &Live,
-) -> Result<Option<Dh>, Failure> {
+fn kinematics(config: &Config, report: &Report, server: &RequestServer, live: &Live) -> Result<Option<Dh>, Failure> {
     match (&config.kinematics, config.link) {
         (Kinematics::File(path), _) => load_kinematics(path, config.model).map(Some),
         (Kinematics::Nominal, _) | (Kinematics::Controller, LinkKind::Mock) => Ok(Some(Dh::nominal(config.model))),

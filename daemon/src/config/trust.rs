@@ -9,7 +9,8 @@ const OTHERS_WRITE: u32 = 0o002;
 const GROUP_WRITE: u32 = 0o020;
 const STICKY: u32 = 0o1000;
 
-/// Refuses a file that somebody else than root and this user owns or can write, or whose folder lets others put another in its place.
+/// Refuses a file that somebody else than root and this user owns or can write, or whose folder lets others put another
+/// in its place.
 ///
 /// A file that its group can write passes where the group is the user's own, as on hosts where each user has one.
 ///

@@ -109,7 +109,8 @@ fn by_signal(folder: &OwnedFd, cell: &str) -> Option<i32> {
         return None;
     }
     let pid = read_pid(&lock)?;
-    // The descriptor is of the process that has this number now; that the lock is still held says that it is the daemon.
+    // The descriptor is of the process that has this number now; that the lock is still held says that it is the
+    // daemon.
     let process = pidfd_open(Pid::from_raw(pid)?, PidfdFlags::empty()).ok()?;
     if !held() {
         return None;

@@ -1,4 +1,5 @@
-//! The runtime folder's side of the stop path: a lock that says which process is the daemon, and the socket it listens on.
+//! The runtime folder's side of the stop path: a lock that says which process is the daemon, and the socket it listens
+//! on.
 
 use crate::exit::Failure;
 use graspd_shm::Names;
@@ -28,8 +29,8 @@ pub(super) fn open_folder(names: &Names) -> Result<OwnedFd, Errno> {
     rustix::fs::open(names.root(), flags, Mode::empty())
 }
 
-/// An address below an open folder: short whatever the folder's path is (a socket's address holds 107 bytes), and no other folder
-/// can be put in its place.
+/// An address below an open folder: short whatever the folder's path is (a socket's address holds 107 bytes), and no
+/// other folder can be put in its place.
 pub(super) fn address(folder: &OwnedFd, name: &str) -> Result<SocketAddrUnix, Errno> {
     SocketAddrUnix::new(format!("/proc/self/fd/{}/{name}", folder.as_raw_fd()))
 }
@@ -51,7 +52,8 @@ impl Door {
     /// Another daemon runs in this cell, or the folder cannot be used.
     pub fn open(names: &Names) -> Result<Door, Failure> {
         let shown = names.root().display();
-        let fail = |what: &str, e: Errno| Failure::link(format!("{shown}: {what} ({e}); is the folder yours and writable?"));
+        let fail =
+            |what: &str, e: Errno| Failure::link(format!("{shown}: {what} ({e}); is the folder yours and writable?"));
         let folder = open_folder(names).map_err(|e| fail("the runtime folder cannot be opened", e))?;
         let (socket, lock_file) = (socket_name(names.cell()), lock_name(names.cell()));
         let flags = OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::CLOEXEC;
@@ -113,7 +115,8 @@ fn listen_at(folder: &OwnedFd, name: &str) -> Result<UnixListener, Errno> {
         Ok(()) | Err(Errno::NOENT) => {}
         Err(e) => return Err(e),
     }
-    let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, SocketFlags::CLOEXEC | SocketFlags::NONBLOCK, None)?;
+    let socket =
+        socket_with(AddressFamily::UNIX, SocketType::STREAM, SocketFlags::CLOEXEC | SocketFlags::NONBLOCK, None)?;
     bind(&socket, &address(folder, name)?)?;
     // Nobody can connect before `listen`, so that the mode is right from the first connection on.
     chmodat(folder, name, Mode::from_raw_mode(0o600), AtFlags::empty())?;

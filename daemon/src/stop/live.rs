@@ -7,6 +7,9 @@ use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
 /// Number of a mode before the first beat.
 const STARTING: u8 = u8::MAX;
 
+/// No exit code of ours.
+const NO_VERDICT: u8 = u8::MAX;
+
 /// Who asked for the last stop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
@@ -19,6 +22,8 @@ pub enum By {
     SecondPublisher = 3,
     /// The daemon itself, because it ends.
     Ending = 4,
+    /// Files of the shared memory are gone or were changed.
+    Damage = 5,
 }
 
 impl By {
@@ -29,6 +34,7 @@ impl By {
             By::Socket => "the stop socket",
             By::SecondPublisher => "a second program publishes frames in this cell; end it",
             By::Ending => "the daemon's end",
+            By::Damage => "the watch over the shared memory",
         }
     }
 
@@ -38,6 +44,7 @@ impl By {
             2 => Some(By::Socket),
             3 => Some(By::SecondPublisher),
             4 => Some(By::Ending),
+            5 => Some(By::Damage),
             _ => None,
         }
     }
@@ -57,6 +64,9 @@ pub struct Live {
     moving: AtomicBool,
     linked: AtomicBool,
     beats: AtomicU64,
+    /// Exit code of the ordered end, once it has come about.
+    verdict: AtomicU8,
+    over: AtomicBool,
 }
 
 impl Default for Live {
@@ -70,6 +80,8 @@ impl Default for Live {
             moving: AtomicBool::new(false),
             linked: AtomicBool::new(false),
             beats: AtomicU64::new(0),
+            verdict: AtomicU8::new(NO_VERDICT),
+            over: AtomicBool::new(false),
         }
     }
 }
@@ -95,6 +107,26 @@ impl Live {
     pub fn who(&self) -> &'static str {
         let by = By::of(self.by.swap(0, Ordering::Relaxed));
         if self.by_signal.swap(false, Ordering::Relaxed) { "a signal" } else { by.map_or("a request", By::words) }
+    }
+
+    /// The arm rests and the process may end with this code, whichever threads are still on their way.
+    pub fn settle(&self, code: u8) {
+        self.verdict.store(code, Ordering::Release);
+    }
+
+    /// The code of the ordered end, once it has come about.
+    pub fn settled(&self) -> Option<u8> {
+        Some(self.verdict.load(Ordering::Acquire)).filter(|code| *code != NO_VERDICT)
+    }
+
+    /// The daemon has been taken apart.
+    pub fn close(&self) {
+        self.over.store(true, Ordering::Release);
+    }
+
+    /// Whether the daemon has been taken apart.
+    pub fn over(&self) -> bool {
+        self.over.load(Ordering::Acquire)
     }
 
     /// The command thread's note at the end of a beat.
@@ -157,7 +189,10 @@ mod tests {
         let live = Live::default();
         assert_eq!(live.mode(), None);
         live.note(ModeName::Servoing, true, true);
-        assert_eq!((live.mode(), live.moving(), live.linked(), live.beats()), (Some(ModeName::Servoing), true, true, 1));
+        assert_eq!(
+            (live.mode(), live.moving(), live.linked(), live.beats()),
+            (Some(ModeName::Servoing), true, true, 1)
+        );
         live.note(ModeName::Fault, false, false);
         assert_eq!((live.mode(), live.moving(), live.linked(), live.beats()), (Some(ModeName::Fault), false, false, 2));
     }

@@ -1,4 +1,5 @@
-//! Ways to stop that need neither the middleware nor the log: signals and a Unix socket, both straight to the stop latch.
+//! Ways to stop that need neither the middleware nor the log: signals and a Unix socket, both straight to the stop
+//! latch.
 //!
 //! | way | what it goes through |
 //! |---|---|
@@ -7,8 +8,8 @@
 //! | `<cell>.stop` | a socket of mode 0600 in the runtime folder, served by the stop thread ([`serve`]) |
 //! | the verb | shared memory and the service thread; the last resort of `graspd stop`, the way of consoles |
 //!
-//! The stop thread allocates, logs, locks and formats nothing. It is also the end of last resort: when the ordered end does not come
-//! about (a thread that hangs in the middleware or in a connection), it ends the process.
+//! The stop thread allocates, logs, locks and formats nothing. It is also the end of last resort: when the ordered end
+//! does not come about (a thread that hangs in the middleware or in a connection), it ends the process.
 
 mod client;
 mod door;

@@ -1,7 +1,7 @@
 //! The stop thread: takes connections, reads one word, pulls the latch, answers with one of a few fixed lines.
 //!
-//! It allocates, locks, logs and formats nothing, and every wait of it is bounded. Whoever connects is asked for his credentials by
-//! the kernel; only the daemon's own user and root are heard.
+//! It allocates, locks, logs and formats nothing, and every wait of it is bounded. Whoever connects is asked for his
+//! credentials by the kernel; only the daemon's own user and root are heard.
 
 use super::live::{By, Live};
 use crate::realtime::now_ns;
@@ -24,13 +24,30 @@ const PAUSE_NS: i64 = 500_000;
 /// The word that stops.
 const WORD: &[u8] = b"stop\n";
 
-/// When and how the process is ended although its ordered end has not come.
+/// When and how the process is ended although its threads have not come back.
 #[derive(Clone, Copy, Debug)]
 pub struct End {
     /// After the end was asked for, ns.
     pub after_ns: u64,
-    /// With this exit code.
+    /// After the ordered end has come about and only threads are waited for, ns; with that end's own code.
+    pub settled_ns: u64,
+    /// The exit code where no ordered end has come about; 0 where no beat has run and nothing could move.
     pub code: u8,
+}
+
+impl End {
+    /// The code to end with at `now`, if it is time. The instants are when the end was asked for, and when it had come
+    /// about.
+    fn due(&self, live: &Live, now: u64, asked: &mut Option<u64>, settled: &mut Option<u64>) -> Option<u8> {
+        let passed = |since: &mut Option<u64>, limit: u64| now.saturating_sub(*since.get_or_insert(now)) > limit;
+        if let Some(code) = live.settled()
+            && passed(settled, self.settled_ns)
+        {
+            return Some(code);
+        }
+        let late = live.ending() && passed(asked, self.after_ns);
+        late.then(|| live.settled().unwrap_or(if live.beats() == 0 { 0 } else { self.code }))
+    }
 }
 
 #[derive(Debug)]
@@ -42,20 +59,17 @@ struct Client {
     asked: Option<(u64, u64)>,
 }
 
-/// Serves until the process ends.
+/// Serves until the daemon is over.
 pub fn serve(listener: &UnixListener, live: &Arc<Live>, end: End) {
     let uid = rustix::process::geteuid().as_raw();
     let mut clients: [Option<Client>; CLIENTS] = std::array::from_fn(|_| None);
     let mut next = 0;
-    let mut end_asked_ns = None;
-    loop {
+    let (mut asked, mut settled) = (None, None);
+    while !live.over() {
         let waits = wait(listener, &clients);
         let now = now_ns();
-        if live.ending() {
-            let since = *end_asked_ns.get_or_insert(now);
-            if now.saturating_sub(since) > end.after_ns {
-                crate::realtime::exit_now(end.code);
-            }
+        if let Some(code) = end.due(live, now, &mut asked, &mut settled) {
+            crate::realtime::exit_now(code);
         }
         if waits {
             for _ in 0..CLIENTS {
@@ -85,7 +99,8 @@ pub fn serve(listener: &UnixListener, live: &Arc<Live>, end: End) {
     }
 }
 
-/// Waits for a connection or a word; true when the listener has one. While an answer is owed it looks every millisecond.
+/// Waits for a connection or a word; true when the listener has one. While an answer is owed it looks every
+/// millisecond.
 fn wait(listener: &UnixListener, clients: &[Option<Client>; CLIENTS]) -> bool {
     let owed = clients.iter().flatten().any(|c| c.asked.is_some());
     let timeout = Timespec { tv_sec: 0, tv_nsec: if owed { 1_000_000 } else { 50_000_000 } };
@@ -152,5 +167,31 @@ const fn answer(taken: bool, mode: Option<ModeName>) -> &'static [u8] {
         (false, Some(ModeName::Servoing)) => b"late servoing\n",
         (false, Some(ModeName::Converged)) => b"late converged\n",
         (false, Some(_)) => b"late at-rest\n",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::atomic::Ordering;
+
+    #[test]
+    fn a_process_that_hangs_is_ended_in_time_and_not_before() {
+        let end = End { after_ns: 1000, settled_ns: 100, code: 4 };
+        let live = Live::default();
+        let (mut asked, mut settled) = (None, None);
+        assert_eq!(end.due(&live, 50_000, &mut asked, &mut settled), None, "nobody asked");
+        live.end.store(true, Ordering::Release);
+        assert_eq!(end.due(&live, 60_000, &mut asked, &mut settled), None);
+        assert_eq!(end.due(&live, 61_000, &mut asked, &mut settled), None);
+        assert_eq!(end.due(&live, 61_001, &mut asked, &mut settled), Some(0), "nothing was ever driven");
+        live.note(ModeName::Idle, false, false);
+        assert_eq!(end.due(&live, 61_001, &mut asked, &mut settled), Some(4));
+        // The ordered end came about; only threads are missing.
+        let (mut asked, mut settled) = (Some(60_000), None);
+        live.settle(5);
+        assert_eq!(end.due(&live, 60_010, &mut asked, &mut settled), None);
+        assert_eq!(end.due(&live, 60_110, &mut asked, &mut settled), None);
+        assert_eq!(end.due(&live, 60_111, &mut asked, &mut settled), Some(5));
     }
 }

@@ -10,6 +10,7 @@
 
 mod acquire;
 mod command;
+mod damage;
 mod refusal;
 mod report;
 mod service;
@@ -21,6 +22,7 @@ mod vision;
 
 pub use acquire::{AcquireReport, run as run_acquire};
 pub use command::CommandWorker;
+pub use damage::run as run_damage;
 pub use refusal::Refusal;
 pub use report::Report;
 pub use service::{Service, ramp_limit};

@@ -1,8 +1,8 @@
 //! What ordinary threads tell each other for the status verb and the log. Locks live here, never on a real-time thread.
 
+use crate::arm::{Said, SaidKind, robot_mode, safety_words};
 use crate::log;
 use crate::stop::Live;
-use crate::arm::{Said, SaidKind, robot_mode, safety_words};
 use crossbeam::queue::ArrayQueue;
 use graspd_rt::cycle::{CycleRecord, Transition, Why};
 use graspd_rt::mode::{FaultCause, ModeName};

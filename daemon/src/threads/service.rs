@@ -66,7 +66,8 @@ impl Service<'_> {
             self.wait_for_the_ramp();
         }
         let reason = result.as_ref().err().map(String::as_str);
-        request.answer(result.is_ok(), &self.report.json(result.is_ok(), reason, &self.marks.text(), &self.shared.live));
+        request
+            .answer(result.is_ok(), &self.report.json(result.is_ok(), reason, &self.marks.text(), &self.shared.live));
     }
 
     /// A refusal, and what is wrong with the robot if anything is.
@@ -80,7 +81,9 @@ impl Service<'_> {
     /// A stop is answered when its ramp has begun.
     fn wait_for_the_ramp(&self) {
         let until = Instant::now() + Duration::from_millis(100);
-        while Instant::now() < until && matches!(self.shared.live.mode(), Some(ModeName::Servoing | ModeName::Converged)) {
+        while Instant::now() < until
+            && matches!(self.shared.live.mode(), Some(ModeName::Servoing | ModeName::Converged))
+        {
             std::thread::sleep(Duration::from_millis(2));
         }
     }

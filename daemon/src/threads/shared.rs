@@ -12,8 +12,8 @@ use graspd_rt::geom::Pose;
 use graspd_rt::mode::Reject;
 use graspd_rt::online::Vision;
 use graspd_rt::setpoint::SetPoint;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
 
 /// Joint positions at an instant, from the command thread to the vision thread.
 #[derive(Clone, Copy, Debug)]
@@ -84,6 +84,8 @@ pub struct Shared {
     pub vision_beat: AtomicU64,
     /// Set when a thread ended by a panic: the command thread stops the arm, the process ends with a failure.
     pub broken: AtomicBool,
+    /// What happened to the shared memory, once something did.
+    pub damage: OnceLock<String>,
     /// Set when all threads have to end.
     pub shutdown: AtomicBool,
 }
@@ -108,6 +110,7 @@ impl Default for Shared {
             counters: VisionCounters::default(),
             vision_beat: AtomicU64::new(0),
             broken: AtomicBool::new(false),
+            damage: OnceLock::new(),
             shutdown: AtomicBool::new(false),
         }
     }
