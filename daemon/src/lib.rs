@@ -8,6 +8,8 @@ pub mod cli;
 pub mod config;
 pub mod exit;
 pub mod links;
+pub mod log;
 pub mod realtime;
+pub mod stop;
 pub mod threads;
 pub mod wiring;

@@ -3,6 +3,7 @@
 use clap::Parser;
 use graspd::cli::{self, Cli, Command};
 use graspd::exit::{Exit, Failure};
+use graspd::log;
 use graspd_shm::control::Verb;
 use std::process::ExitCode;
 
@@ -17,9 +18,14 @@ fn main() -> ExitCode {
         }
     };
     match run(cli.command) {
-        Ok(exit) => ExitCode::from(exit.code()),
+        Ok(exit) => {
+            log::flush(std::time::Duration::from_millis(300));
+            ExitCode::from(exit.code())
+        }
         Err(failure) => {
-            eprintln!("graspd: {failure}");
+            log::say(&failure);
+            // A daemon's log may be stuck; its end waits for that no longer than this.
+            log::flush(std::time::Duration::from_millis(300));
             ExitCode::from(failure.exit.code())
         }
     }
@@ -40,7 +46,7 @@ fn run(command: Command) -> Result<Exit, Failure> {
         Command::Status(args) => cli::send(&args, Verb::Status, b""),
         Command::Arm(args) => cli::send(&args, Verb::Arm, b""),
         Command::Servo(args) => cli::send(&args, Verb::Servo, b""),
-        Command::Stop(args) => cli::send(&args, Verb::Stop, b""),
+        Command::Stop(args) => cli::stop(&args),
         Command::Reset(args) => cli::send(&args, Verb::Reset, b""),
         Command::Gripper(args) => cli::send(&args.client, Verb::Gripper, args.way.as_bytes()),
         Command::Recover(args) => cli::recover(&args),

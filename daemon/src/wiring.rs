@@ -3,14 +3,18 @@
 use crate::config::{Config, Kinematics, LinkKind, cycle_config};
 use crate::exit::{Exit, Failure};
 use crate::links::{LinkManager, ur_config};
+use crate::log;
 use crate::realtime::{RealtimeReport, ThreadSettings, enter, lock_memory};
-use crate::threads::{AcquireReport, CommandWorker, Report, Service, Shared, VisionWorker, run_acquire, run_telemetry};
+use crate::stop::{Door, End, Live, catch_signals, serve};
+use crate::threads::{
+    AcquireReport, CommandWorker, Report, Service, Shared, VisionWorker, ramp_limit, run_acquire, run_damage,
+    run_telemetry,
+};
 use graspd_rt::arm::Dh;
 use graspd_rt::cycle::CommandCycle;
 use graspd_shm::control::{RequestServer, Verb};
 use graspd_shm::create_node;
 use serde_json::Value;
-use signal_hook::consts::{SIGINT, SIGTERM};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -22,31 +26,32 @@ use std::time::Duration;
 /// # Errors
 /// A link that cannot be made at the start, a host that refuses real time where it is required, or a fault of our own.
 pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [SIGTERM, SIGINT] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).map_err(|e| {
-            Failure::link(format!("signals cannot be caught ({e}); the daemon would not stop the arm when it is ended"))
-        })?;
-    }
-    let node = create_node(&config.names, "graspd").map_err(|e| Failure::link(e.to_string()))?;
+    log::start().map_err(|e| Failure::link(format!("the log thread cannot be started ({e})")))?;
+    let shared = Shared::default();
+    catch_signals(&shared.live).map_err(|e| {
+        Failure::link(format!("signals cannot be caught ({e}); the daemon would not stop the arm when it is ended"))
+    })?;
     // First of all: this refuses a second daemon in the cell before anything talks to a robot.
+    config.names.ensure_root(false).map_err(|e| Failure::link(e.to_string()))?;
+    let mut door = Door::open(&config.names)?;
+    start_stop_thread(config, &mut door, &shared.live)?;
+    let _over = Over(&shared.live);
+    let node = create_node(&config.names, "graspd").map_err(|e| Failure::link(e.to_string()))?;
     let server = RequestServer::new(&node).map_err(|e| Failure::link(e.to_string()))?;
     let report = Report::default();
-    let dh = kinematics(config, &report, &server, &stop)?;
+    let dh = kinematics(config, &report, &server, &shared.live)?;
     let Some(dh) = dh else { return Ok(Exit::Done) };
 
-    let shared = Shared::default();
     let marks = AcquireReport::default();
     let recover = AtomicBool::new(false);
     let mut host = RealtimeReport::default();
     lock_memory(&mut host);
     let (host_in, host_out) = channel::<RealtimeReport>();
 
+    let door = &door;
     std::thread::scope(|scope| -> Result<Exit, Failure> {
-        let end = |failure: Failure| {
-            shared.shutdown.store(true, Ordering::Release);
-            Err(failure)
-        };
+        // However this scope is left, by a panic as well: its threads end, or it would wait for them for ever.
+        let _end = EndOfThreads(&shared);
         let spawn = |name: &str| std::thread::Builder::new().name(name.to_owned());
         let vision_settings = thread_settings(config.raw.beat.vision_priority, config.raw.beat.vision_core);
         let command_settings = thread_settings(config.raw.beat.command_priority, config.raw.beat.command_core);
@@ -78,7 +83,7 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
                     let mut worker = match VisionWorker::new(config, dh, node_ref, shared_ref) {
                         Ok(worker) => worker,
                         Err(e) => {
-                            eprintln!("graspd: {e}");
+                            log::say(&e);
                             shared_ref.broken.store(true, Ordering::Release);
                             return;
                         }
@@ -93,7 +98,7 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
                 spawn("acquire").spawn_scoped(scope, move || {
                     shared_ref.guarded("acquire", || {
                         if let Err(e) = run_acquire(config, node_ref, shared_ref, marks) {
-                            eprintln!("graspd: {e}");
+                            log::say(&e);
                             shared_ref.broken.store(true, Ordering::Release);
                         }
                     });
@@ -104,7 +109,7 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
                 spawn("telemetry").spawn_scoped(scope, move || {
                     shared_ref.guarded("telemetry", || {
                         if let Err(e) = run_telemetry(config, node_ref, shared_ref, report) {
-                            eprintln!("graspd: {e}");
+                            log::say(&e);
                         }
                     });
                 })
@@ -113,9 +118,15 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
                 let manager = LinkManager::new(config, &shared, &report, &recover);
                 spawn("link").spawn_scoped(scope, move || shared_ref.guarded("link", || manager.run()))
             })
+            .and_then(|_| {
+                let paths = door.paths();
+                spawn("damage").spawn_scoped(scope, move || {
+                    shared_ref.guarded("damage", || run_damage(node_ref, paths, shared_ref));
+                })
+            })
             .map(|_| ());
         if let Err(e) = started {
-            return end(Failure::link(format!(
+            return Err(Failure::link(format!(
                 "a thread could not be started ({e}); raise the process's thread limit"
             )));
         }
@@ -126,7 +137,7 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
         }
         report.refused(&host.refused);
         if config.raw.beat.require_realtime && !host.complete() {
-            return end(Failure::link(format!(
+            return Err(Failure::link(format!(
                 "loop.require_realtime is true and the host refused: {}",
                 host.refused.join("; ")
             )));
@@ -134,7 +145,7 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
         match CommandCycle::new(cycle_config(config, dh, host.complete())) {
             Ok(cycle) => drop(cycle_in.send(cycle)),
             Err(e) => {
-                return end(Failure::input(format!(
+                return Err(Failure::input(format!(
                     "{}: limits: {} = {} must lie between {} and {} for this arm",
                     config_path.display(),
                     e.key,
@@ -144,18 +155,68 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
                 )));
             }
         }
-        println!("{}", serde_json::json!({ "ready": true, "pid": std::process::id(), "cell": config.names.cell() }));
+        let ready = serde_json::json!({ "ready": true, "pid": std::process::id(), "cell": config.names.cell() });
+        log::line(log::Stream::Out, ready.to_string());
         let service =
             Service { config, config_path, shared: &shared, report: &report, marks: &marks, recover: &recover };
-        service.serve(&server, &stop);
-        shared.shutdown.store(true, Ordering::Release);
-        if shared.broken.load(Ordering::Acquire) {
-            return Err(Failure::fault(
-                "a thread of the daemon ended by itself; the arm was stopped; see the lines above",
-            ));
-        }
-        Ok(Exit::Done)
+        shared.guarded("service", || service.serve(&server));
+        let verdict = verdict(&shared);
+        shared.live.settle(verdict.as_ref().map_or_else(|failure| failure.exit.code(), |exit| exit.code()));
+        verdict
     })
+}
+
+/// How an ordered end is reported.
+fn verdict(shared: &Shared) -> Result<Exit, Failure> {
+    if shared.broken.load(Ordering::Acquire) {
+        return Err(Failure::fault("a thread of the daemon ended by itself; the arm was stopped; see the lines above"));
+    }
+    // Said already; what remains is the exit code and the sentence at the end.
+    shared.damage.get().map_or(Ok(Exit::Done), |reason| Err(Failure::link(reason.clone())))
+}
+
+/// Ends the threads when it is dropped.
+struct EndOfThreads<'a>(&'a Shared);
+
+impl Drop for EndOfThreads<'_> {
+    fn drop(&mut self) {
+        self.0.shutdown.store(true, Ordering::Release);
+    }
+}
+
+/// Lets the stop thread go when the daemon is over: what runs on in this process is not its business.
+struct Over<'a>(&'a Live);
+
+impl Drop for Over<'_> {
+    fn drop(&mut self) {
+        self.0.close();
+    }
+}
+
+/// Beyond the ramp: ending the script, and an answer that was being given.
+const END_NS: u64 = 3_000_000_000;
+/// For the threads when the arm rests: one that waits for a controller's answer is not waited for.
+const SETTLED_NS: u64 = 1_000_000_000;
+
+/// Starts the stop thread, which is not joined: it outlives everything else, because it is what ends a process that hangs.
+/// Its priority lies just below the command thread's: it must run while pictures are tracked, and does next to nothing.
+fn start_stop_thread(config: &Config, door: &mut Door, live: &Arc<Live>) -> Result<(), Failure> {
+    let Some(listener) = door.listener() else { return Ok(()) };
+    let priority = config.raw.beat.command_priority.saturating_sub(1).max(config.raw.beat.vision_priority);
+    let after_ns = ramp_limit(config).as_nanos() as u64 + END_NS;
+    let end = End { after_ns, settled_ns: SETTLED_NS, code: Exit::Link.code() };
+    let live = Arc::clone(live);
+    std::thread::Builder::new()
+        .name("stop".to_owned())
+        .spawn(move || {
+            // What the host refuses here it refuses to the command thread as well, which reports it.
+            enter("stop", &thread_settings(priority, None), &mut RealtimeReport::default());
+            serve(&listener, &live, end);
+        })
+        .map(drop)
+        .map_err(|e| {
+            Failure::link(format!("the stop thread cannot be started ({e}); raise the process's thread limit"))
+        })
 }
 
 fn thread_settings(priority: u8, core: Option<usize>) -> ThreadSettings {
@@ -164,12 +225,7 @@ fn thread_settings(priority: u8, core: Option<usize>) -> ThreadSettings {
 
 /// The arm's kinematics by the configuration. With "controller" this waits until the controller answers, or the daemon is ended
 /// (`None`): nothing may be commanded with another arm's geometry.
-fn kinematics(
-    config: &Config,
-    report: &Report,
-    server: &RequestServer,
-    stop: &AtomicBool,
-) -> Result<Option<Dh>, Failure> {
+fn kinematics(config: &Config, report: &Report, server: &RequestServer, live: &Live) -> Result<Option<Dh>, Failure> {
     match (&config.kinematics, config.link) {
         (Kinematics::File(_, dh), _) => Ok(Some(**dh)),
         (Kinematics::Nominal, _) | (Kinematics::Controller, LinkKind::Mock) => Ok(Some(Dh::nominal(config.model))),
@@ -182,14 +238,14 @@ fn kinematics(
                 Err(e) => report.link(&format!("waiting for the controller's kinematics: {e}")),
             }
             for _ in 0..20 {
-                if stop.load(Ordering::Acquire) {
+                if live.ending() {
                     return Ok(None);
                 }
                 // Nothing runs yet, but whoever asks is told why.
                 while let Ok(Some(request)) = server.next() {
                     let accepted = matches!(request.verb, Verb::Status | Verb::Stop);
                     let reason = "the daemon waits for the controller and cannot do that yet";
-                    request.answer(accepted, &report.json(accepted, (!accepted).then_some(reason), "", Value::Null));
+                    request.answer(accepted, &report.json(accepted, (!accepted).then_some(reason), "", live, Value::Null));
                 }
                 std::thread::sleep(Duration::from_millis(50));
             }

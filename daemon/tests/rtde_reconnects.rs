@@ -88,7 +88,7 @@ fn a_hostile_wire_leaves_nothing_behind_and_moves_nothing() {
                 assert_eq!(note.record.mode, ModeName::Idle, "a new link arms nothing");
             }
             let said: serde_json::Value =
-                serde_json::from_str(&report.json(true, None, "", serde_json::Value::Null)).unwrap();
+                serde_json::from_str(&report.json(true, None, "", &shared.live, serde_json::Value::Null)).unwrap();
             let words = |key: &str| said[key].as_str().unwrap().to_owned();
             // A loss is followed by the next attempt at once, and is remembered.
             for (robot, last) in [(words("robot"), &mut last), (words("robot_last_loss"), &mut lost)] {

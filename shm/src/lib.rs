@@ -13,8 +13,11 @@ mod error;
 pub mod frame;
 pub mod names;
 pub mod node;
+mod private;
 mod sys;
+mod vital;
 
 pub use error::ShmError;
 pub use names::{Names, NamesError};
 pub use node::{Ipc, ShmNode, create_node};
+pub use vital::{Damage, Vital};

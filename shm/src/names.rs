@@ -1,7 +1,7 @@
 //! Where shared files live and how services are called: root folder, prefix, cell.
 
 use iceoryx2::prelude::*;
-use rustix::fs::{FileType, Mode, mkdir, stat};
+use rustix::fs::{FileType, Mode, lstat, mkdir};
 use std::path::{Path as StdPath, PathBuf};
 
 /// Root folder, prefix and cell: two processes meet only when all three are equal.
@@ -41,6 +41,16 @@ pub enum NamesError {
     )]
     Insecure {
         /// The folder.
+        path: String,
+        /// What is wrong with it.
+        reason: String,
+        /// The user this process runs as.
+        uid: u32,
+    },
+    /// A file of the shared memory is not this user's.
+    #[error("'{path}' cannot be used: {reason}, and this program runs as uid {uid}; remove it as its owner or as root")]
+    Foreign {
+        /// The file.
         path: String,
         /// What is wrong with it.
         reason: String,
@@ -130,9 +140,12 @@ impl Names {
         }
         let uid = rustix::process::geteuid().as_raw();
         let insecure = |reason: String| NamesError::Insecure { path: shown.clone(), reason, uid };
-        let st = stat(&self.root).map_err(|e| insecure(e.to_string()))?;
-        if FileType::from_raw_mode(st.st_mode) != FileType::Directory {
-            return Err(insecure("it is not a folder".into()));
+        // Not followed: in a folder like /tmp anybody can put a link where ours is looked for.
+        let st = lstat(&self.root).map_err(|e| insecure(e.to_string()))?;
+        match FileType::from_raw_mode(st.st_mode) {
+            FileType::Directory => {}
+            FileType::Symlink => return Err(insecure("it is a symbolic link".into())),
+            _ => return Err(insecure("it is not a folder".into())),
         }
         if st.st_uid != uid {
             return Err(insecure(format!("it belongs to uid {}", st.st_uid)));
@@ -185,5 +198,16 @@ mod tests {
         assert!(matches!(names.ensure_root(false), Err(NamesError::Insecure { .. })));
         names.ensure_root(true).unwrap();
         std::fs::remove_dir(&dir).unwrap();
+    }
+
+    #[test]
+    fn a_link_in_the_place_of_the_root_is_refused() {
+        let dir = std::env::temp_dir().join(format!("graspd-names-link-{}", std::process::id()));
+        let link = dir.join("root");
+        std::fs::create_dir_all(dir.join("elsewhere")).unwrap();
+        std::os::unix::fs::symlink(dir.join("elsewhere"), &link).unwrap();
+        let said = Names::new(&link, "t_", "c").unwrap().ensure_root(false).unwrap_err().to_string();
+        assert!(said.contains("symbolic link"), "{said}");
+        std::fs::remove_dir_all(&dir).unwrap();
     }
 }

@@ -1,6 +1,6 @@
 //! The one iceoryx2 node of a process.
 
-use crate::{Names, ShmError};
+use crate::{Names, ShmError, private};
 use iceoryx2::prelude::*;
 
 /// The service variant everything here uses: between processes, ports not shared between threads.
@@ -27,6 +27,9 @@ pub fn create_node_with(names: &Names, role: &str, allow_insecure: bool) -> Resu
     // iceoryx2 logs to stderr, and warns that it found no configuration file: by design there is none.
     set_log_level_from_env_or(LogLevel::Fatal);
     names.ensure_root(allow_insecure)?;
+    if !allow_insecure {
+        private::management_segment(names)?;
+    }
     let fail = |reason: String| ShmError::Node {
         root: names.root().display().to_string(),
         prefix: names.prefix().to_string(),
@@ -52,6 +55,11 @@ impl ShmNode {
     /// The names the node was created with.
     pub fn names(&self) -> &Names {
         &self.names
+    }
+
+    /// Number of the node, as its files are called.
+    pub(crate) fn number(&self) -> String {
+        self.node.id().value().to_string()
     }
 
     /// Removes what processes that died without saying goodbye left behind. Takes milliseconds: never on a real-time thread.

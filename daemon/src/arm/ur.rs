@@ -124,7 +124,7 @@ impl UrLink {
                 && let Some(package) = self.framer.next()?
             {
                 if let Event::Text(text) = self.session.handle(package)? {
-                    eprintln!("controller says: {text}");
+                    crate::log::say(format_args!("controller says: {text}"));
                 }
             }
             if self.session.phase() == Phase::Running {

@@ -4,6 +4,7 @@ use super::args::{ClientArgs, SetpointArgs};
 use crate::config::Config;
 use crate::exit::{Exit, Failure};
 use crate::realtime::now_ns;
+use crate::stop::{Heard, ask as ask_to_stop};
 use graspd_shm::control::{Answer, RequestClient, Verb};
 use graspd_shm::{Names, create_node};
 use serde_json::Value;
@@ -19,13 +20,17 @@ fn names(args: &ClientArgs) -> Result<Names, Failure> {
 
 /// A way to the daemon.
 fn connect(args: &ClientArgs) -> Result<RequestClient, Failure> {
+    connect_to(&names(args)?, args)
+}
+
+fn connect_to(names: &Names, args: &ClientArgs) -> Result<RequestClient, Failure> {
     if !(args.timeout.is_finite() && args.timeout > 0.0 && args.timeout <= 3600.0) {
         return Err(Failure {
             exit: Exit::Usage,
             message: format!("--timeout {} is not a number of seconds from 0 to 3600", args.timeout),
         });
     }
-    let node = create_node(&names(args)?, "graspd-client").map_err(|e| Failure::link(e.to_string()))?;
+    let node = create_node(names, "graspd-client").map_err(|e| Failure::link(e.to_string()))?;
     RequestClient::new(&node).map_err(|e| Failure::link(e.to_string()))
 }
 
@@ -49,6 +54,41 @@ fn show(args: &ClientArgs, answer: &Answer) {
     } else {
         print_words(&answer.json);
     }
+}
+
+/// `graspd stop`: by the stop socket, else by a signal; over shared memory only where both fail. Of the configuration it needs the cell
+/// and the shared-memory root alone: a file that has become unusable must not stand between an operator and a stop.
+///
+/// # Errors
+/// No daemon by any of the ways, or one whose command thread does not take the stop.
+pub fn stop(args: &ClientArgs) -> Result<Exit, Failure> {
+    let names = match &args.config {
+        Some(path) => crate::config::names_of(path)?,
+        None => crate::config::names(&args.cell, args.shm_root.as_deref())?,
+    };
+    let (by, state) = match ask_to_stop(&names) {
+        Heard::Socket { taken: true, mode } => ("socket", mode),
+        Heard::Socket { taken: false, mode } => {
+            return Err(Failure::fault(format!(
+                "the daemon has the stop, and its command thread does not take it (last {mode}); the controller's watchdog stops the \
+                 arm; use the emergency stop if it moves"
+            )));
+        }
+        Heard::Signal { .. } => ("signal", "signalled".to_owned()),
+        Heard::Nobody(why) => {
+            return by_verb(&names, args).map_err(|e| Failure { message: format!("{e}\n{why}"), ..e });
+        }
+    };
+    let answer = serde_json::json!({ "accepted": true, "by": by, "state": state });
+    show(args, &Answer { accepted: true, json: answer.to_string() });
+    Ok(Exit::Done)
+}
+
+/// A stop over shared memory.
+fn by_verb(names: &Names, args: &ClientArgs) -> Result<Exit, Failure> {
+    let answer = ask(&connect_to(names, args)?, args, Verb::Stop, b"")?;
+    show(args, &answer);
+    verdict(&answer)
 }
 
 /// How long a recovery may take: power, brakes, unlocking, and a new session.

@@ -15,7 +15,7 @@ pub use args::{
     Cli, ClientArgs, Command, DemoArgs, GripperArgs, PassThrough, PlanArgs, ReconstructArgs, RunArgs, SetpointArgs,
     StudyArgs,
 };
-pub use client::{recover, send, setpoint};
+pub use client::{recover, send, setpoint, stop};
 pub use mesh::MeshArgs;
 pub use plan::plan;
 pub use reconstruct::reconstruct;

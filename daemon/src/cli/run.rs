@@ -3,6 +3,8 @@
 use super::args::RunArgs;
 use crate::config::{Config, Kinematics};
 use crate::exit::{Exit, Failure};
+use crate::log;
+use crate::realtime::ignore_background_writes;
 use crate::wiring;
 
 /// `graspd run`: the daemon.
@@ -11,6 +13,8 @@ use crate::wiring;
 /// Configuration, links, or a fault of our own.
 pub fn run(args: &RunArgs) -> Result<Exit, Failure> {
     let config = Config::load(&args.config)?;
+    log::take_panics();
+    ignore_background_writes();
     wiring::run(&config, &args.config)
 }
 

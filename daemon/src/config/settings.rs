@@ -115,6 +115,7 @@ impl Config {
     /// Names the file, the key, the value and the fix.
     pub fn load(path: &Path) -> Result<Self, Failure> {
         let shown = path.display();
+        super::check_trust(path)?;
         let text = std::fs::read_to_string(path).map_err(|e| {
             Failure::input(format!("{shown}: cannot be read ({e}); docs/CONFIG.md has an example to start from"))
         })?;
@@ -143,6 +144,9 @@ impl Config {
         let folder = path.parent().unwrap_or(Path::new("."));
         let names = names(&raw.cell, raw.shm.root.as_deref().map(|r| folder.join(r)).as_deref())
             .map_err(|e| Failure::input(format!("{shown}: {e}")))?;
+        for file in [&raw.files.rig, &raw.files.gripper] {
+            super::check_trust(&folder.join(file))?;
+        }
         let rig = RigFile::load(&folder.join(&raw.files.rig)).map_err(|e| Failure::input(e.to_string()))?;
         let gripper = GripperFile::load(&folder.join(&raw.files.gripper)).map_err(|e| Failure::input(e.to_string()))?;
         let link = match raw.arm.link.as_str() {
@@ -155,6 +159,7 @@ impl Config {
             "nominal" => Kinematics::Nominal,
             file => {
                 let file = folder.join(file);
+                super::check_trust(&file)?;
                 let dh = Box::new(load_kinematics(&file, model)?);
                 Kinematics::File(file, dh)
             }

@@ -6,4 +6,4 @@ mod sys;
 
 pub use beat::{Beat, Tick, now_ns, sleep_until};
 pub use setup::{RealtimeReport, ThreadSettings, enter, lock_memory};
-pub use sys::thread_faults;
+pub use sys::{exit_now, ignore_background_writes, thread_faults};

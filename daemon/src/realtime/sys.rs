@@ -1,4 +1,4 @@
-//! The crate's only unsafe code: the scheduler call that no safe wrapper offers.
+//! The crate's only unsafe code: the few calls that no safe wrapper offers.
 
 /// Puts the calling thread under SCHED_FIFO with this priority (1 to 99).
 ///
@@ -10,6 +10,20 @@ pub(super) fn set_fifo(priority: u8) -> std::io::Result<()> {
     // which the kernel only reads.
     let rc = unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const param) };
     if rc == 0 { Ok(()) } else { Err(std::io::Error::last_os_error()) }
+}
+
+/// Ends the process at once: no destructor, no exit handler, no flushing, each of which a stuck thread could hold up.
+pub fn exit_now(code: u8) -> ! {
+    // SAFETY: `_exit` takes any number, touches no memory of ours and does not return.
+    unsafe { libc::_exit(i32::from(code)) }
+}
+
+/// Lets a write to a terminal from the background go through (with `stty tostop` the kernel would stop the whole process for it).
+pub fn ignore_background_writes() {
+    // SAFETY: SIG_IGN is a valid disposition for SIGTTOU, and no handler of ours is involved.
+    unsafe {
+        libc::signal(libc::SIGTTOU, libc::SIG_IGN);
+    }
 }
 
 /// Page faults (minor, major) and involuntary context switches of the calling thread so far.

@@ -56,7 +56,6 @@ impl<'a> CommandWorker<'a> {
         while !self.shared.ending() {
             let tick = beat.wait();
             self.beat(&tick);
-            self.shared.command_beat.fetch_add(1, Ordering::Relaxed);
         }
     }
 
@@ -77,7 +76,6 @@ impl<'a> CommandWorker<'a> {
             }
             sleep_until(lock.arrived(now_ns(), come));
             self.beat(&Tick { deadline_ns, woke_ns: now_ns(), skipped });
-            self.shared.command_beat.fetch_add(1, Ordering::Relaxed);
             let stamp = self.robot.filter(|_| self.packages == 1).map(|r| r.timestamp_s);
             skipped = lock.advance(now_ns(), stamp);
         }
@@ -112,7 +110,7 @@ impl<'a> CommandWorker<'a> {
             self.unanswered = Some(middle(v));
         }
         let setpoint = self.shared.setpoint.take();
-        let request = if self.shared.stop_latch.swap(false, Ordering::AcqRel) {
+        let request = if self.shared.live.take() {
             Some(graspd_rt::cycle::Request { id: 0, kind: graspd_rt::cycle::RequestKind::Stop })
         } else {
             self.shared.requests.pop()
@@ -128,6 +126,8 @@ impl<'a> CommandWorker<'a> {
         });
         self.send(&out.command);
         let done = now_ns();
+        let moving = out.command.rates.iter().any(|r| *r != 0.0);
+        self.shared.live.note(out.record.mode, moving, self.link.is_some());
         if let Some(reply) = out.reply {
             let _ = self.shared.replies.force_push(reply);
         }

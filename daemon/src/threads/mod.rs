@@ -11,6 +11,7 @@
 mod acquire;
 mod advice;
 mod command;
+mod damage;
 mod refusal;
 mod report;
 mod service;
@@ -22,9 +23,10 @@ mod vision;
 
 pub use acquire::{AcquireReport, run as run_acquire};
 pub use command::CommandWorker;
+pub use damage::run as run_damage;
 pub use refusal::Refusal;
 pub use report::Report;
-pub use service::Service;
+pub use service::{Service, ramp_limit};
 pub use shared::{JointSample, Seed, Shared, VisionCounters};
 pub use slot::Slot;
 pub use telemetry::{BeatRecord, fault_number, run as run_telemetry, why_words};

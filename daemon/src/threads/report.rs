@@ -1,6 +1,8 @@
 //! What ordinary threads tell each other for the status verb and the log. Locks live here, never on a real-time thread.
 
 use crate::arm::{Said, SaidKind, robot_mode, safety_words};
+use crate::log;
+use crate::stop::Live;
 use crossbeam::queue::ArrayQueue;
 use graspd_rt::cycle::{CycleRecord, Grip, Transition, Why};
 use graspd_rt::mode::{FaultCause, ModeName};
@@ -10,9 +12,8 @@ use serde_json::{Value, json};
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 struct State {
-    mode: Option<ModeName>,
     cause: String,
     link: String,
     /// How the last link ended: "connecting" follows at once.
@@ -22,7 +23,6 @@ struct State {
     refusal: String,
     lasting: Option<FaultCause>,
     sample: TelemetrySample,
-    rest: bool,
     grip: Grip,
     /// Age of the newest usable image, ns; `u64::MAX` before the first.
     image_age_ns: u64,
@@ -37,7 +37,7 @@ struct State {
 }
 
 /// A walk out of a stop that an operator has asked for.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 struct Recovery {
     /// Counts them, so that who asked can tell the new one from the last.
     number: u64,
@@ -92,18 +92,14 @@ impl Report {
 
     /// Notes a change of mode. What began a stop stays its reason when the arm has come to rest.
     pub fn transition(&self, event: &Transition, why: &str) {
-        let mut s = self.lock();
-        s.mode = Some(event.to);
         if !matches!(event.why, Why::AtRest) {
-            why.clone_into(&mut s.cause);
+            why.clone_into(&mut self.lock().cause);
         }
     }
 
     /// Notes a beat.
     pub fn beat(&self, record: &CycleRecord) {
         let mut s = self.lock();
-        s.mode = Some(record.mode);
-        s.rest = record.command.rates.iter().all(|r| *r == 0.0);
         s.lasting = record.lasting;
         (s.grip, s.image_age_ns) = (record.grip, record.vision_age_ns);
     }
@@ -130,7 +126,7 @@ impl Report {
     pub fn link(&self, words: &str) {
         let mut s = self.lock();
         if s.link != words {
-            eprintln!("graspd: robot link: {words}");
+            log::say(format_args!("robot link: {words}"));
             if words.starts_with("lost") {
                 words.clone_into(&mut s.last_loss);
             }
@@ -169,7 +165,7 @@ impl Report {
             s.stop_kind = Some(said.kind);
         }
         if s.said.back() != Some(&said.text) {
-            eprintln!("graspd: controller says: {}", said.text);
+            log::say(format_args!("controller says: {}", said.text));
             if s.said.len() == SAID {
                 s.said.pop_front();
             }
@@ -188,7 +184,7 @@ impl Report {
 
     /// A step of it is done.
     pub fn recover_step(&self, words: &str) {
-        eprintln!("graspd: recover: {words}");
+        log::say(format_args!("recover: {words}"));
         let steps = &mut self.lock().recovery.steps;
         if steps.len() < STEPS {
             steps.push(words.to_owned());
@@ -208,7 +204,7 @@ impl Report {
     /// Notes what the host refused.
     pub fn refused(&self, what: &[String]) {
         for line in what {
-            eprintln!("graspd: not real-time: {line}");
+            log::say(format_args!("not real-time: {line}"));
         }
         self.lock().refused.extend_from_slice(what);
     }
@@ -228,24 +224,17 @@ impl Report {
         self.setpoints.pop()
     }
 
-    /// The mode, once the first beat has run.
-    pub fn mode(&self) -> Option<ModeName> {
-        self.lock().mode
-    }
-
-    /// Whether the last command was to rest.
-    pub fn at_rest(&self) -> bool {
-        self.lock().rest
-    }
-
-    /// The whole state as one JSON object, with what else the caller knows.
-    pub fn json(&self, accepted: bool, reason: Option<&str>, marks: &str, more: Value) -> String {
+    /// The whole state as one JSON object, with what else the caller knows. Mode and motion are the last beat's own; nothing is formatted under
+    /// the lock.
+    pub fn json(&self, accepted: bool, reason: Option<&str>, marks: &str, live: &Live, more: Value) -> String {
         let (_, image_age_ms) = self.images();
-        let s = self.lock();
+        let s = self.lock().clone();
         let t = &s.sample;
+        let lost = log::lost();
         let mut v = json!({
             "accepted": accepted,
-            "state": s.mode.map_or("starting", ModeName::as_str),
+            "state": live.mode().map_or("starting", ModeName::as_str),
+            "moving": live.moving(),
             "cause": s.cause,
             "robot": s.link,
             "robot_last_loss": s.last_loss,
@@ -274,6 +263,8 @@ impl Report {
             "frame_to_command_us": percentiles(&t.frame_to_command_us),
             "round_trip_us": percentiles(&t.round_trip_us),
             "not_realtime": s.refused,
+            "log_lines_lost": lost.dropped + lost.failed,
+            "log_blocked": lost.blocked,
         });
         if let (Some(reason), Some(map)) = (reason, v.as_object_mut()) {
             map.insert("reason".into(), json!(reason));
@@ -290,7 +281,7 @@ mod tests {
     use super::*;
 
     fn status(report: &Report) -> Value {
-        serde_json::from_str(&report.json(true, None, "", Value::Null)).unwrap()
+        serde_json::from_str(&report.json(true, None, "", &Live::default(), Value::Null)).unwrap()
     }
 
     #[test]

@@ -4,8 +4,12 @@ use super::acquire::AcquireReport;
 use super::advice;
 use super::report::Report;
 use super::shared::Shared;
-use crate::config::Config;
+use crate::arm::{UrConfig, stop_script};
+use crate::config::{Config, LinkKind};
+use crate::links::ur_config;
+use crate::log;
 use crate::realtime::now_ns;
+use crate::stop::By;
 use graspd_calib::files::PlanFile;
 use graspd_rt::cycle::{Request as CycleRequest, RequestKind};
 use graspd_rt::mode::{ModeName, Reject};
@@ -23,6 +27,8 @@ const MAX_AGE_NS: u64 = 250_000_000;
 const MAX_AHEAD_NS: u64 = 1_000_000;
 /// Images older than this are part of the answer to why the arm cannot be armed.
 const OLD_IMAGE_MS: f64 = 100.0;
+/// How long ending the control script may take; the arm rests already.
+const SCRIPT_END: Duration = Duration::from_millis(300);
 /// How long the command thread may take to answer: many beats.
 const ANSWER_WITHIN: Duration = Duration::from_millis(500);
 
@@ -49,7 +55,7 @@ impl Service<'_> {
         let result = match (request.verb, out_of_time(request.stamp_ns, now_ns())) {
             (Verb::Status, _) => Ok(()),
             (Verb::Stop, _) => {
-                self.shared.stop_latch.store(true, Ordering::Release);
+                self.shared.live.stop(By::Verb);
                 Ok(())
             }
             (Verb::Reset, _) => self.ask(id, RequestKind::Reset),
@@ -64,7 +70,8 @@ impl Service<'_> {
             self.wait_for_the_ramp();
         }
         let reason = result.as_ref().err().map(String::as_str);
-        let json = self.report.json(result.is_ok(), reason, &self.marks.text(), self.configured());
+        let more = self.configured();
+        let json = self.report.json(result.is_ok(), reason, &self.marks.text(), &self.shared.live, more);
         request.answer(result.is_ok(), &json);
     }
 
@@ -103,7 +110,9 @@ impl Service<'_> {
     /// A stop is answered when its ramp has begun.
     fn wait_for_the_ramp(&self) {
         let until = Instant::now() + Duration::from_millis(100);
-        while Instant::now() < until && matches!(self.report.mode(), Some(ModeName::Servoing | ModeName::Converged)) {
+        while Instant::now() < until
+            && matches!(self.shared.live.mode(), Some(ModeName::Servoing | ModeName::Converged))
+        {
             std::thread::sleep(Duration::from_millis(2));
         }
     }
@@ -168,7 +177,7 @@ impl Service<'_> {
     }
 
     fn recover(&self, id: u64) -> Result<(), String> {
-        match self.report.mode() {
+        match self.shared.live.mode() {
             Some(ModeName::Servoing | ModeName::Converged | ModeName::Stopping) => {
                 return Err("the arm is moving; stop first".to_owned());
             }
@@ -180,11 +189,12 @@ impl Service<'_> {
         Ok(())
     }
 
-    /// Serves until `stop` is set by a signal, or a thread broke. Then the arm is ramped down before this returns.
-    pub fn serve(&self, server: &RequestServer, stop: &AtomicBool) {
+    /// Serves until the end is asked for, or a thread broke. Then the arm is ramped down before this returns.
+    pub fn serve(&self, server: &RequestServer) {
         let mut id = 1;
         let mut beats = (0, Instant::now());
-        while !stop.load(Ordering::Acquire) && !self.shared.broken.load(Ordering::Acquire) {
+        let mut failing = false;
+        while !self.shared.live.ending() && !self.shared.broken.load(Ordering::Acquire) {
             match server.next() {
                 Ok(Some(request)) => {
                     id += 1;
@@ -192,16 +202,18 @@ impl Service<'_> {
                 }
                 Ok(None) => std::thread::sleep(Duration::from_millis(2)),
                 Err(e) => {
-                    eprintln!("graspd: {e}");
+                    if !std::mem::replace(&mut failing, true) {
+                        log::say(&e);
+                    }
                     std::thread::sleep(Duration::from_millis(200));
                 }
             }
-            let now = self.shared.command_beat.load(Ordering::Relaxed);
+            let now = self.shared.live.beats();
             if now != beats.0 {
                 beats = (now, Instant::now());
             } else if beats.1.elapsed() > Duration::from_secs(2) {
-                eprintln!(
-                    "graspd: the command thread has stood still for 2 s; ending, so that the robot's own watchdog holds it stopped"
+                log::say(
+                    "the command thread has stood still for 2 s; ending, so that the robot's own watchdog holds it stopped",
                 );
                 self.shared.broken.store(true, Ordering::Release);
             }
@@ -209,13 +221,21 @@ impl Service<'_> {
         self.ramp_down();
     }
 
-    /// Stops the arm and waits until it rests, at most a second.
+    /// Stops the arm, waits until it rests, and ends the control script: the arm is then left to no watchdog.
     fn ramp_down(&self) {
-        self.shared.stop_latch.store(true, Ordering::Release);
-        let until = Instant::now() + Duration::from_millis(800);
-        std::thread::sleep(Duration::from_millis(30));
-        while Instant::now() < until && !self.report.at_rest() {
-            std::thread::sleep(Duration::from_millis(5));
+        let live = &self.shared.live;
+        live.stop(By::Ending);
+        // From here on every beat asks for a stop, also where no signal has asked for the end.
+        live.end.store(true, Ordering::Release);
+        let (from, until) = (live.beats(), Instant::now() + ramp_limit(self.config));
+        while Instant::now() < until && (live.moving() || live.beats() < from + 2) {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        if self.config.link == LinkKind::Rtde && live.linked() && !live.moving() {
+            let config = UrConfig { timeout: SCRIPT_END, ..ur_config(self.config) };
+            if let Err(e) = stop_script(&config) {
+                log::say(format_args!("the control script is left to the controller's watchdog: {e}"));
+            }
         }
     }
 }

@@ -3,6 +3,8 @@
 use super::slot::Slot;
 use super::telemetry::BeatRecord;
 use crate::arm::ArmLink;
+use crate::log;
+use crate::stop::Live;
 use crossbeam::queue::ArrayQueue;
 use graspd_rt::arm::Joints;
 use graspd_rt::cycle::{Reply, Request};
@@ -11,6 +13,7 @@ use graspd_rt::mode::Reject;
 use graspd_rt::online::Vision;
 use graspd_rt::setpoint::SetPoint;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
 
 /// Joint positions at an instant, from the command thread to the vision thread.
 #[derive(Clone, Copy, Debug)]
@@ -65,8 +68,8 @@ pub struct Shared {
     pub requests: ArrayQueue<Request>,
     /// Command to service: answers.
     pub replies: ArrayQueue<Reply>,
-    /// Set to stop at the next beat, ahead of every queued request.
-    pub stop_latch: AtomicBool,
+    /// The stop latch, ahead of every queued request, and what the last beat did.
+    pub live: Arc<Live>,
     /// Command to telemetry: what was noted.
     pub records: ArrayQueue<BeatRecord>,
     /// Link manager to command: a link that is ready.
@@ -77,12 +80,12 @@ pub struct Shared {
     pub drop_link: AtomicBool,
     /// Counters of the vision thread.
     pub counters: VisionCounters,
-    /// Counts beats of the command thread: the heart the supervisor listens to.
-    pub command_beat: AtomicU64,
     /// Counts looks of the vision thread.
     pub vision_beat: AtomicU64,
     /// Set when a thread ended by a panic: the command thread stops the arm, the process ends with a failure.
     pub broken: AtomicBool,
+    /// What happened to the shared memory, once something did.
+    pub damage: OnceLock<String>,
     /// Set when all threads have to end.
     pub shutdown: AtomicBool,
 }
@@ -99,15 +102,15 @@ impl Default for Shared {
             setpoint_reply: Slot::default(),
             requests: ArrayQueue::new(8),
             replies: ArrayQueue::new(8),
-            stop_latch: AtomicBool::new(false),
+            live: Arc::default(),
             records: ArrayQueue::new(2048),
             link_ready: Slot::default(),
             link_dead: Slot::default(),
             drop_link: AtomicBool::new(false),
             counters: VisionCounters::default(),
-            command_beat: AtomicU64::new(0),
             vision_beat: AtomicU64::new(0),
             broken: AtomicBool::new(false),
+            damage: OnceLock::new(),
             shutdown: AtomicBool::new(false),
         }
     }
@@ -123,9 +126,9 @@ impl Shared {
     pub fn guarded(&self, name: &str, work: impl FnOnce()) {
         if std::panic::catch_unwind(std::panic::AssertUnwindSafe(work)).is_err() {
             self.broken.store(true, Ordering::Release);
-            eprintln!(
-                "graspd: thread {name} ended by a bug of ours; the arm is being stopped. Please report the lines above."
-            );
+            log::say(format_args!(
+                "thread {name} ended by a bug of ours; the arm is being stopped. Please report the lines above."
+            ));
         }
     }
 }

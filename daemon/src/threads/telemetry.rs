@@ -6,7 +6,8 @@ use super::report::Report;
 use super::shared::Shared;
 use super::timing::Latency;
 use crate::config::Config;
-use graspd_rt::cycle::{CycleRecord, Stage, Transition, Why};
+use crate::log;
+use graspd_rt::cycle::{CycleRecord, RequestKind, Stage, Transition, Why};
 use graspd_rt::gripper::MAX_MARKS;
 use graspd_rt::mode::{FaultCause, ModeName};
 use graspd_rt::online::Vision;
@@ -104,10 +105,13 @@ pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &Report) ->
             note(&mut latencies, &beat);
             if let Some(event) = beat.event {
                 let mut why = why_words(&event.why);
+                if event.why == Why::Request(RequestKind::Stop) {
+                    why = format!("{why}, by {}", shared.live.who());
+                }
                 if let (Why::Fault(FaultCause::FramesStale { .. }), false) = (event.why, refused.is_empty()) {
                     why = format!("{why}; pictures were refused: {refused}");
                 }
-                eprintln!("graspd: {} -> {}: {why}", event.from.as_str(), event.to.as_str());
+                log::say(format_args!("{} -> {}: {why}", event.from.as_str(), event.to.as_str()));
                 report.transition(&event, &why);
                 match event.why {
                     Why::Fault(cause) => {
@@ -143,6 +147,8 @@ pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &Report) ->
         sample.compute_us = latencies.compute.percentiles();
         sample.frame_to_command_us = latencies.frame.percentiles();
         sample.round_trip_us = latencies.round_trip.percentiles();
+        let lost = log::lost();
+        sample.log_lost = u32::try_from(lost.dropped + lost.failed).unwrap_or(u32::MAX);
         sample.sequence += 1;
         report.sample(&sample, settled);
         // A full subscriber list or a dying reader must not end the daemon; the next sample follows in 20 ms.
@@ -162,7 +168,7 @@ fn refusals(shared: &Shared, report: &Report, seen: &mut (u64, u32, Instant), wo
     if count != seen.0 {
         if why != seen.1 || words.is_empty() {
             *words = Refusal::words(why);
-            eprintln!("graspd: pictures are refused: {words}");
+            log::say(format_args!("pictures are refused: {words}"));
             report.refusal(words);
         }
         *seen = (count, why, Instant::now());

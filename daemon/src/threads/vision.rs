@@ -4,6 +4,7 @@ use super::refusal::Refusal;
 use super::shared::{Seed, Shared};
 use crate::config::Config;
 use crate::realtime::{Beat, now_ns};
+use crate::stop::By;
 use graspd_rt::arm::Dh;
 use graspd_rt::geom::Pose;
 use graspd_rt::image::ImageView;
@@ -105,8 +106,14 @@ impl<'a> VisionWorker<'a> {
             counters.refused.fetch_add(1, Ordering::Relaxed);
             counters.refusal.store(why.number(), Ordering::Relaxed);
         };
-        if matches!(received.source, Some(SourceEvent::First | SourceEvent::TakenOver)) {
-            cycle.reset();
+        match received.source {
+            Some(SourceEvent::First | SourceEvent::TakenOver) => {
+                cycle.reset();
+                *last = None;
+            }
+            // Which of the two shows this rig is not known any more: nothing moves by either (H06).
+            Some(SourceEvent::SecondPublisher) => shared.live.stop(By::SecondPublisher),
+            None => {}
         }
         let Some(frame) = received.frame else {
             shared.needs_seed.store(cycle.needs_acquisition(), Ordering::Release);

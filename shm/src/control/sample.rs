@@ -90,8 +90,8 @@ pub struct TelemetrySample {
     pub mark_count: u32,
     /// Marks seen, left and right.
     pub marks_seen: [u32; 2],
-    /// Zero.
-    pub reserved: u32,
+    /// Log lines that were lost: the log's stream is stuck, full or closed.
+    pub log_lost: u32,
     /// Seen marks by view and index, px; NaN where not seen.
     pub marks: [[[f32; 2]; TELEMETRY_MARKS]; 2],
     /// Goal of each mark by view and index, px; NaN where none.
@@ -142,7 +142,7 @@ impl Default for TelemetrySample {
             gain: 0.0,
             mark_count: 0,
             marks_seen: [0; 2],
-            reserved: 0,
+            log_lost: 0,
             marks: [[[f32::NAN; 2]; TELEMETRY_MARKS]; 2],
             goals: [[[f32::NAN; 2]; TELEMETRY_MARKS]; 2],
             wakeup_us: Percentiles::default(),

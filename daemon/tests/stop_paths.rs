@@ -1,0 +1,233 @@
+//! Every way to stop and to end, on real processes: with the log stuck, closed or on a full disk, by socket, signal and
+//! verb, with a second program publishing. The oracle is the mock controller's wire record.
+#![cfg(feature = "demo")]
+#![allow(clippy::unwrap_used)] // a test: a failure is to be seen at once
+
+mod cell;
+#[path = "cell/stops.rs"]
+mod stops;
+#[path = "cell/wire.rs"]
+mod wire;
+
+use cell::{Extra, Process, World, ask, summary};
+use rustix::process::Signal;
+use std::process::{Command, Stdio};
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+use stops::{Cell, by_socket, closed_pipe, daemon_on, end_by, full_disk, full_pipe};
+
+/// One cell at a time: two would share the processors that the bounds are measured on.
+static ONE: Mutex<()> = Mutex::new(());
+
+/// While it moves the daemon says so, whatever its log is doing.
+fn says_that_it_moves(cell: &mut Cell) {
+    for _ in 0..5 {
+        cell.drive(Duration::from_millis(400));
+        let (_, said) = cell.world.verb(&["status"]);
+        if said["state"] == "servoing" {
+            assert_eq!(said["moving"], true, "{said}");
+            assert!(cell.world.verb(&["stop"]).0);
+            return;
+        }
+        println!("passed over: {} {}", said["state"], said["cause"]);
+        cell.world.verb(&["stop"]);
+    }
+    panic!("status never said that it was servoing");
+}
+
+#[test]
+fn a_log_that_is_stuck_closed_or_full_takes_no_stop_away() {
+    let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut cell = Cell::new(31);
+    let names = cell.names();
+    for what in ["full pipe", "closed pipe", "full disk"] {
+        let mut kept = Vec::new();
+        let mut stream = || match what {
+            "full pipe" => {
+                let (end, reader) = full_pipe();
+                kept.push(reader);
+                end
+            }
+            "closed pipe" => closed_pipe(),
+            _ => full_disk(),
+        };
+        let mut daemon = daemon_on(&cell.world, stream(), stream());
+        says_that_it_moves(&mut cell);
+        let (_, said) = cell.world.verb(&["status"]);
+        if what == "full pipe" {
+            assert_eq!(said["log_blocked"], true, "{said}");
+        } else {
+            assert!(said["log_lines_lost"].as_u64().unwrap() > 0, "{said}");
+        }
+        let (stop, _) = cell.stop(&mut |_| by_socket(&names));
+        stop.check(&format!("{what}, socket"));
+        end_by(&mut cell, &mut daemon, Signal::TERM, &format!("{what}, SIGTERM"));
+    }
+    cell.check_limits();
+    cell.clean();
+}
+
+/// The queue itself: a flood beyond its room is counted, and nobody waits for it.
+#[test]
+fn a_flood_of_lines_is_dropped_and_counted() {
+    let (end, reader) = full_pipe();
+    let mut child = Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "flood_of_lines_helper", "--include-ignored", "--nocapture"])
+        .env("GRASPD_FLOOD", "1")
+        .stdout(Stdio::null())
+        .stderr(end)
+        .spawn()
+        .unwrap();
+    let begun = Instant::now();
+    let status = loop {
+        if let Some(status) = child.try_wait().unwrap() {
+            break status;
+        }
+        if begun.elapsed() > Duration::from_secs(10) {
+            child.kill().unwrap();
+            panic!("logging waits for a pipe that nobody reads");
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    };
+    assert!(status.success(), "{status}");
+    drop(reader);
+}
+
+/// Runs in a process of its own whose standard error is stuck; without that there is nothing to look at.
+#[test]
+fn flood_of_lines_helper() {
+    if std::env::var_os("GRASPD_FLOOD").is_none() {
+        return;
+    }
+    graspd::log::start().unwrap();
+    let begun = Instant::now();
+    for n in 0..5000 {
+        graspd::log::say(format_args!("line {n}"));
+    }
+    assert!(begun.elapsed() < Duration::from_millis(500), "{:?}", begun.elapsed());
+    graspd::log::flush(Duration::from_millis(600));
+    let lost = graspd::log::lost();
+    // 1024 wait, one may be in the hand of the thread.
+    assert!((5000 - 1025..=5000 - 1024).contains(&lost.dropped) && lost.blocked, "{lost:?}");
+    graspd::realtime::exit_now(0);
+}
+
+#[test]
+fn signals_and_the_command_line_stop_and_end_in_order() {
+    let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut cell = Cell::new(32);
+    let mut daemon = cell.world.daemon();
+    let (stop, _) = cell.stop(&mut |_| daemon.signal(Signal::USR1));
+    stop.check("SIGUSR1");
+    let (state, cause) = cell.world.state();
+    assert_eq!((state.as_str(), cause.contains("by a signal")), ("tracking", true), "{cause}");
+    // The whole program, with its start; and with a configuration that has become unusable.
+    let config = cell.world.path("graspd.toml");
+    let good = std::fs::read_to_string(&config).unwrap();
+    for text in [good.clone(), good.replace("[vision]", "[nonsense]\nx = 1\n[vision]").replace("rig.toml", "gone.toml")]
+    {
+        let (stop, _) = cell.stop(&mut |c| {
+            std::fs::write(&config, &text).unwrap();
+            let (accepted, said) = c.world.verb(&["stop"]);
+            assert!(accepted && said["by"] == "socket", "{said}");
+            std::fs::write(&config, &good).unwrap();
+        });
+        println!("graspd stop as a program: {:.1} ms", stop.latency_ms);
+    }
+    assert!(cell.world.state().1.contains("the stop socket"));
+    // The socket taken away: the signal goes to the process that holds the lock; the daemon then ends, for it cannot be
+    // found any more.
+    let names = cell.names();
+    let socket = names.root().join(graspd::stop::socket_name("kill"));
+    let (stop, _) = cell.stop(&mut |_| {
+        std::fs::remove_file(&socket).unwrap();
+        let heard = graspd::stop::ask(&names);
+        assert!(matches!(heard, graspd::stop::Heard::Signal { .. }), "{heard:?}");
+    });
+    stop.check("socket deleted, signal by the lock");
+    assert_eq!(stops::ended(&mut daemon, Duration::from_secs(4)), Some(4));
+    assert!(cell.world.log().contains("kill.stop is gone"), "{}", cell.world.log());
+    for (signal, name) in [(Signal::HUP, "SIGHUP"), (Signal::INT, "SIGINT")] {
+        let mut daemon = cell.world.daemon();
+        end_by(&mut cell, &mut daemon, signal, name);
+    }
+    // Nobody there: said at once, and clearly.
+    let begun = Instant::now();
+    assert!(!cell.world.verb(&["stop"]).0);
+    assert!(begun.elapsed() < Duration::from_secs(5), "{:?}", begun.elapsed());
+    cell.check_limits();
+    cell.clean();
+}
+
+#[test]
+fn a_second_publisher_stops_the_arm() {
+    let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut cell = Cell::new(33);
+    let daemon = cell.world.daemon();
+    let mut second: Option<Process> = None;
+    cell.drive(Duration::from_millis(300));
+    // Where its start takes longer than the way, an arming meets it.
+    second.replace(cell.world.scene());
+    let until = Instant::now() + Duration::from_secs(10);
+    let cause = loop {
+        let (state, cause) = cell.world.state();
+        if cause.contains("second program") {
+            assert_ne!(state, "servoing");
+            break cause;
+        }
+        if state == "tracking" || state == "armed" {
+            // At rest before the second one came: an arming meets it.
+            cell.world.verb(&["setpoint", &cell.world.path("plan.toml")]);
+            cell.world.verb(&["arm"]);
+        }
+        assert!(Instant::now() < until, "still {state}: {cause}\n{}", cell.world.log());
+        std::thread::sleep(Duration::from_millis(30));
+    };
+    println!("second publisher: {cause}");
+    std::thread::sleep(Duration::from_millis(300));
+    let (accepted, said) = cell.world.verb(&["servo"]);
+    assert!(!accepted, "{said}");
+    // The second scene's own connection makes the mock's judge forget ours: the limits are held against the record
+    // here.
+    let sent: Vec<_> = (cell.wire.read().into_iter())
+        .filter_map(|e| match e {
+            wire::Entry::Beat { beat, mode, rates, .. } => Some((beat, if mode == 1 { rates } else { [0.0; 6] })),
+            _ => None,
+        })
+        .collect();
+    for w in sent.windows(2) {
+        let room = 4.0 * 0.002 * 1.01 * f64::from((w[1].0 - w[0].0).max(1)) + 1e-9;
+        assert!((0..6).all(|i| (w[1].1[i] - w[0].1[i]).abs() <= room && w[1].1[i].abs() <= 0.5 + 1e-9), "{w:?}");
+    }
+    assert!(sent.iter().any(|s| s.1 != [0.0; 6]), "it was driven before");
+    assert_eq!(sent.last().unwrap().1, [0.0; 6], "at rest");
+    drop((daemon, second));
+    cell.clean();
+}
+
+/// Four clients that ask without rest, a log that is stuck: a console that is there already stops by its verb, others
+/// by the socket.
+#[test]
+fn many_requests_a_second_delay_no_stop() {
+    let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut cell = Cell::new(34);
+    let (err, _kept) = full_pipe();
+    let _daemon = daemon_on(&cell.world, Stdio::null(), err);
+    let names = cell.names();
+    let node = graspd_shm::create_node(&names, "graspd-console").unwrap();
+    let console = graspd_shm::control::RequestClient::new(&node).unwrap();
+    std::thread::scope(|scope| {
+        let load = stops::Load::start(scope, &names, 1000);
+        for _ in 0..3 {
+            let (stop, _) = cell.stop(&mut |_| by_socket(&names));
+            stop.check("1,000 requests a second, socket");
+            let (stop, _) = cell.stop(&mut |_| stops::by_verb_of(&console));
+            stop.check("1,000 requests a second, verb");
+        }
+        let asked = load.end();
+        println!("{asked:.0} requests a second were answered");
+        assert!(asked > 300.0, "no load: {asked:.0} requests a second");
+    });
+    cell.check_limits();
+    cell.clean();
+}
