@@ -1,7 +1,7 @@
 //! The vision thread: newest pair, track, gripper pose. It owns the frame subscriber, and nothing it does can delay the arm's beat.
 
 use super::refusal::Refusal;
-use super::shared::{Seed, Shared};
+use super::shared::{RigSeen, Seed, Shared};
 use crate::config::Config;
 use crate::realtime::{Beat, now_ns};
 use graspd_rt::arm::Dh;
@@ -150,6 +150,8 @@ impl<'a> VisionWorker<'a> {
             Ok(_) if cycle.health().frozen_run >= FROZEN_FRAMES && moves(history, middle) => refuse(Refusal::Frozen),
             Ok(vision) => {
                 counters.frames.fetch_add(1, Ordering::Relaxed);
+                let residual_px = [vision.residual_px, vision.inner_residual_px];
+                shared.rig_seen.put(RigSeen { rig: vision.rig, seen: vision.seen, residual_px });
                 shared.vision.put(vision);
                 shared.vision_seen.put(vision);
             }
