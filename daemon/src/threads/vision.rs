@@ -19,6 +19,9 @@ const FROZEN_FRAMES: u32 = 5;
 /// Joint motion within the last tenth of a second that a picture has to show, rad.
 const SEEN_MOTION: f64 = 1e-3;
 
+/// Joints this much older than a pair say nothing about where the arm was then, ns: ten packages of 500 Hz.
+const JOINTS_OLD_NS: u64 = 20_000_000;
+
 /// Whether the arm moved before `at_ns`, by its encoders.
 fn moves(history: &JointHistory, at_ns: u64) -> bool {
     let (Some(now), Some(then)) = (history.at(at_ns), history.at(at_ns.saturating_sub(100_000_000))) else {
@@ -143,7 +146,9 @@ impl<'a> VisionWorker<'a> {
             cycle.seed(moved(capture_ns, &left_from_gripper).unwrap_or(left_from_gripper));
             counters.acquired.fetch_add(1, Ordering::Relaxed);
         }
-        let base_from_gripper = history.at(middle).map(|q| dh.base_from_gripper(&q, flange_from_gripper));
+        let fresh = middle <= history.newest_ns().saturating_add(JOINTS_OLD_NS);
+        let joints = history.at(middle).filter(|_| fresh);
+        let base_from_gripper = joints.map(|q| dh.base_from_gripper(&q, flange_from_gripper));
         let pair = StereoFrame { left, right, sequence: frame.sequence(), capture_ns: capture, now_ns: now };
         match cycle.step(&pair, base_from_gripper) {
             // What the pictures say is then old, whatever their stamps say: let it age.

@@ -44,7 +44,7 @@ fn run(w: &mut World, tracking: bool, wait_ms: u64, knock: Option<(View, Twist)>
         for k in 0..2 {
             end.evidence[k] = end.evidence[k].max(rig.evidence[k]);
         }
-        if rig.moves + rig.shakes > 0 {
+        if rig.moves + rig.shakes > 0 || rig.suspicious {
             end.warned = true;
             end.after_ms = end.after_ms.or(knocked_at.map(|t| (w.now - t) / MS));
         }
@@ -98,7 +98,7 @@ fn clean_runs_raise_no_alarm() {
             w.misplace_rig();
         }
         let end = run(&mut w, false, u64::MAX / (2 * MS), None);
-        assert!(end.moves == 0 && end.shakes == 0, "seed {seed}: {end:?}");
+        assert!(end.moves == 0 && end.shakes == 0 && !end.warned, "seed {seed}: {end:?}");
         arrived += u32::from(end.converged_mm.is_some());
         for k in 0..2 {
             worst[k] = worst[k].max(end.evidence[k]);
