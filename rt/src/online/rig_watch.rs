@@ -10,12 +10,13 @@
 //! A step makes the watch suspicious at once, which stops the arm; what it was is decided at rest, where encoders and images cannot
 //! disagree about a motion: a camera that was moved is still moved then, a disturbance is over.
 
+use super::likelihood::{STEP, free_pose, gain, scaled, scaled_score, scaled_vector, set_cross, solve, start};
 use super::pose::MarkTable;
-use super::rig_fit::{Evidence, Joint, JointVector, RigMatrix, UNKNOWNS};
+use super::rig_fit::{Evidence, Joint, JointVector, RigMatrix};
 use crate::geom::{Pose, RIG_UNKNOWNS, Rig, RigError, RigOffset, Twist, adjoint, exp_twist, log_pose};
 use crate::gripper::Gripper;
 use crate::math;
-use nalgebra::{Matrix6, SMatrix, SVector, Vector6};
+use nalgebra::{Matrix6, Vector6};
 
 /// What is expected of marks, arm and cameras, and when a change counts.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -89,13 +90,6 @@ const UNDECIDED_M: f64 = 0.02;
 const ABSURD_M: f64 = 0.1;
 /// Length that makes a turn comparable with a shift, metres.
 const LENGTH: f64 = 0.1;
-/// How far a camera may be moved, one deviation, and the unit of each unknown in here: the whole rig by 10 mm and 0.6 degrees, one
-/// camera by 0.6 degrees, 0.5 % of magnification and 10 px.
-const STEP: [f64; UNKNOWNS] =
-    [1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 5e-3, 5e-3, 10.0, 10.0, 10.0, 10.0];
-/// Deviation of a pose that nothing predicts, in units of [`STEP`].
-const UNKNOWN_POSE: f64 = 30.0;
-
 /// The filter; covariances in units of [`STEP`].
 #[derive(Clone, Copy, Debug)]
 struct State {
@@ -380,24 +374,6 @@ impl RigWatch {
     }
 }
 
-/// Covariance at the start: a pose that nothing predicts, the stated error.
-fn start(spread: &RigMatrix) -> Joint {
-    let mut p = Joint::zeros();
-    p.fixed_view_mut::<RIG_UNKNOWNS, RIG_UNKNOWNS>(6, 6).copy_from(spread);
-    free_pose(&mut p);
-    p
-}
-
-fn free_pose(p: &mut Joint) {
-    p.fixed_view_mut::<6, 6>(0, 0).copy_from(&(Matrix6::identity() * math::sq(UNKNOWN_POSE)));
-    set_cross(p, &SMatrix::zeros());
-}
-
-fn set_cross(p: &mut Joint, cross: &SMatrix<f64, 6, RIG_UNKNOWNS>) {
-    p.fixed_view_mut::<6, RIG_UNKNOWNS>(0, 6).copy_from(cross);
-    p.fixed_view_mut::<RIG_UNKNOWNS, 6>(6, 0).copy_from(&cross.transpose());
-}
-
 /// The filter's step.
 fn learn(mut s: State, information: &Joint, score: &JointVector) -> Option<State> {
     // P' = P (I + S P)^-1, from its transpose (I + P S)^-1 P.
@@ -414,72 +390,4 @@ fn learn(mut s: State, information: &Joint, score: &JointVector) -> Option<State
 
 fn size(xi: &Twist) -> f64 {
     math::sqrt(xi.fixed_rows::<3>(0).norm_squared() + math::sq(LENGTH) * xi.fixed_rows::<3>(3).norm_squared())
-}
-
-fn scaled(information: &Joint) -> Joint {
-    Joint::from_fn(|i, j| information[(i, j)] * STEP[i] * STEP[j])
-}
-
-fn scaled_score(score: &JointVector) -> JointVector {
-    JointVector::from_fn(|i, _| score[i] * STEP[i])
-}
-
-/// From units of [`STEP`] to metres, radians and pixels.
-fn scaled_vector(x: &JointVector) -> JointVector {
-    JointVector::from_fn(|i, _| x[i] * STEP[i])
-}
-
-/// Chi-squared by which the unknowns explain more when their covariance is `wide` instead of `narrow`, and the unknowns then.
-fn gain<const N: usize>(
-    information: &SMatrix<f64, N, N>,
-    score: &SVector<f64, N>,
-    narrow: &SMatrix<f64, N, N>,
-    wide: &SMatrix<f64, N, N>,
-) -> Option<(f64, SVector<f64, N>)> {
-    let with = |p: &SMatrix<f64, N, N>| -> Option<SVector<f64, N>> {
-        Some(p * solve(SMatrix::<f64, N, N>::identity() + information * p, *score)?)
-    };
-    let (a, b) = (with(narrow)?, with(wide)?);
-    let chi2 = score.dot(&(b - a));
-    (chi2.is_finite() && b.iter().all(|v| v.is_finite())).then_some((chi2.max(0.0), b))
-}
-
-/// Solves `m x = b` by elimination with row pivots; `None` where a pivot is nothing or no number.
-fn solve<const N: usize, const K: usize>(
-    mut m: SMatrix<f64, N, N>,
-    mut b: SMatrix<f64, N, K>,
-) -> Option<SMatrix<f64, N, K>> {
-    for c in 0..N {
-        let mut best = c;
-        for r in c + 1..N {
-            if math::fabs(m[(r, c)]) > math::fabs(m[(best, c)]) {
-                best = r;
-            }
-        }
-        let pivot = m[(best, c)];
-        if !(math::fabs(pivot) > 1e-300 && pivot.is_finite()) {
-            return None;
-        }
-        m.swap_rows(c, best);
-        b.swap_rows(c, best);
-        for r in c + 1..N {
-            let f = m[(r, c)] / pivot;
-            for k in c + 1..N {
-                m[(r, k)] -= f * m[(c, k)];
-            }
-            for k in 0..K {
-                b[(r, k)] -= f * b[(c, k)];
-            }
-        }
-    }
-    for c in (0..N).rev() {
-        for k in 0..K {
-            let mut sum = b[(c, k)];
-            for j in c + 1..N {
-                sum -= m[(c, j)] * b[(j, k)];
-            }
-            b[(c, k)] = sum / m[(c, c)];
-        }
-    }
-    Some(b)
 }

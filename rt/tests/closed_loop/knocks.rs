@@ -42,9 +42,7 @@ fn run(w: &mut World, tracking: bool, wait_ms: u64, knock: Option<(View, Twist)>
     let note = |w: &World, end: &mut End, knocked_at: Option<u64>| {
         let rig = w.watch.health();
         (end.moves, end.shakes) = (rig.moves, rig.shakes);
-        for k in 0..2 {
-            end.evidence[k] = end.evidence[k].max(rig.evidence[k]);
-        }
+        end.evidence = std::array::from_fn(|k| end.evidence[k].max(rig.evidence[k]));
         if rig.moves + rig.shakes > 0 || rig.suspicious {
             end.warned = true;
             end.after_ms = end.after_ms.or(knocked_at.map(|t| (w.now - t) / MS));
@@ -101,9 +99,7 @@ fn clean_runs_raise_no_alarm() {
         let end = run(&mut w, false, u64::MAX / (2 * MS), None);
         assert!(end.moves == 0 && end.shakes == 0 && !end.warned, "seed {seed}: {end:?}");
         arrived += u32::from(end.converged_mm.is_some());
-        for k in 0..2 {
-            worst[k] = worst[k].max(end.evidence[k]);
-        }
+        worst = std::array::from_fn(|k| worst[k].max(end.evidence[k]));
     }
     println!(
         "200 clean runs, 40 of them with a wrong rig: {arrived} converged, evidence at most {worst:.2?} of significant"
