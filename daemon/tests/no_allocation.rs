@@ -207,10 +207,17 @@ fn neither_real_time_thread_touches_the_heap_while_servoing_or_stopping() {
         let mut seen = String::new();
         // A stalled host may put another fault before the one that was meant; then once more.
         for _ in 0..4 {
-            if operator.state().0 != "armed" {
-                operator.insist(Verb::Arm, b"");
+            // A fault of the robot's link hits the scene's own as well: its images then lag behind the encoders, which is a moved camera
+            // as far as anybody can tell. An operator who knows better gives the set-point again.
+            let until = Instant::now() + Duration::from_secs(30);
+            while let Err(e) = operator.ask(Verb::Servo, b"") {
+                assert!(Instant::now() < until, "{e}");
+                if e.contains("camera was moved") {
+                    let _ = operator.ask(Verb::Setpoint, &plan);
+                }
+                let _ = operator.ask(Verb::Arm, b"");
+                std::thread::sleep(Duration::from_millis(100));
             }
-            operator.insist(Verb::Servo, b"");
             OPEN.store(true, Ordering::SeqCst);
             if operator.until("moving", Duration::from_secs(5), |s, _| s == "servoing").is_some() {
                 std::thread::sleep(Duration::from_millis(250));

@@ -175,12 +175,8 @@ impl<'a> Prepared<'a> {
         let lenses = View::BOTH.map(|v| Lens::new(rig.rig.camera(v)));
         let p = View::BOTH.map(|v| projection(&rig.rig, v));
         let noise = pictures[0].noise().max(pictures[1].noise());
-        let t0 = std::time::Instant::now();
         let found = spots(pictures, [&lenses[0], &lenses[1]], [&p[0], &p[1]], noise);
         let seen = RigError::observe(&rig.rig, prior, &found.matches);
-        if std::env::var("DBG").is_ok() {
-            eprintln!("  spots {:.1} ms {:?} unknown {:.3} phi-size {:.3}", t0.elapsed().as_secs_f64() * 1e3, seen.seen, seen.unknown_px(), seen.spread());
-        }
         let edges = View::BOTH.map(|v| ViewEdges::new(pictures[v.index()], seen.rig.camera(v)));
         Ok(Self { edges, seen, pictures, rig, votes: found.votes })
     }

@@ -1,7 +1,7 @@
 //! The acquisition thread: finds the marks from scratch whenever the vision thread has lost them. An ordinary thread: it searches
 //! whole pictures, which may take tens of milliseconds.
 
-use super::shared::{Seed, Shared};
+use super::shared::{RigSeen, Seed, Shared};
 use super::vision::policy;
 use crate::config::Config;
 use crate::realtime::now_ns;
@@ -57,6 +57,50 @@ fn words(failure: &AcquireFailure) -> String {
     }
 }
 
+/// A residual above which the rig itself is worth a word, pixels: it comes with a millimetre at the grasp.
+const POOR_RIG_PX: f64 = 0.5;
+/// Deviations of its stated error above which a rig is likelier to be stated wrongly than to be off by chance.
+const POOR_RIG_SIGMAS: f64 = 4.0;
+
+/// What the marks say against the rig while they are tracked; empty when nothing.
+fn rig_words(s: &RigSeen, marks: usize) -> String {
+    let mut said = Vec::new();
+    let [residual, inner] = s.residual_px;
+    if s.rig.moves > 0 {
+        said.push(format!(
+            "a camera was moved {} time(s) since the start, the last by what leads the gripper {:.1} mm astray: check the calibration; plans from before are refused",
+            s.rig.moves,
+            s.rig.astray_m * 1e3
+        ));
+    } else if s.rig.shakes > 0 {
+        said.push(format!(
+            "a camera moved slightly {} time(s), by what leads the gripper {:.1} mm astray: fasten it",
+            s.rig.shakes,
+            s.rig.astray_m * 1e3
+        ));
+    }
+    if s.rig.offset_sigmas > POOR_RIG_SIGMAS {
+        said.push(format!(
+            "the rig seems {:.0} times as wrong as it states (residual {residual:.2} px, {inner:.2} px with that taken out): calibrate again, or state its error in [quality] of rig.toml",
+            s.rig.offset_sigmas
+        ));
+    } else if residual > POOR_RIG_PX {
+        let why = if inner < 0.5 * residual {
+            "the rig's calibration is off: calibrate again for less than a millimetre at the grasp"
+        } else {
+            "the marks do not stand as the gripper file says, or are poorly seen"
+        };
+        said.push(format!("residual {residual:.2} px: {why}"));
+    }
+    if s.seen.iter().any(|n| *n < 3) {
+        said.push("only one view shows the marks".into());
+    }
+    if said.is_empty() {
+        return String::new();
+    }
+    format!("{} left, {} right of {marks}; {}", s.seen[0], s.seen[1], said.join("; "))
+}
+
 /// Runs until shutdown.
 ///
 /// # Errors
@@ -69,7 +113,9 @@ pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &AcquireRep
     while !shared.ending() {
         std::thread::sleep(Duration::from_millis(20));
         if !shared.needs_seed.load(Ordering::Acquire) {
-            report.set(String::new());
+            if let Some(seen) = shared.rig_seen.take() {
+                report.set(rig_words(&seen, config.gripper.gripper.marks.len()));
+            }
             continue;
         }
         let received = subscriber.newest(now_ns());
@@ -100,4 +146,27 @@ pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &AcquireRep
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use graspd_rt::online::rig_watch::RigHealth;
+
+    #[test]
+    fn a_good_rig_says_nothing_and_every_other_says_why() {
+        let good = RigSeen { rig: RigHealth::default(), seen: [12, 11], residual_px: [0.02, 0.01] };
+        assert_eq!(rig_words(&good, 16), "");
+        let says = |s: RigSeen, what: &str| {
+            let text = rig_words(&s, 16);
+            assert!(text.starts_with(&format!("{} left, {} right of 16; ", s.seen[0], s.seen[1])), "{text}");
+            assert!(text.contains(what), "{text}");
+        };
+        says(RigSeen { residual_px: [1.2, 0.05], ..good }, "the rig's calibration is off");
+        says(RigSeen { residual_px: [1.2, 1.1], ..good }, "gripper file");
+        says(RigSeen { rig: RigHealth { offset_sigmas: 6.0, ..good.rig }, ..good }, "6 times as wrong as it states");
+        says(RigSeen { rig: RigHealth { moves: 1, astray_m: 0.007, ..good.rig }, ..good }, "7.0 mm astray");
+        says(RigSeen { rig: RigHealth { shakes: 2, astray_m: 0.0003, ..good.rig }, ..good }, "fasten it");
+        says(RigSeen { seen: [9, 0], ..good }, "only one view");
+    }
 }

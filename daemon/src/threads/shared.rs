@@ -11,6 +11,7 @@ use graspd_rt::cycle::{Reply, Request};
 use graspd_rt::geom::Pose;
 use graspd_rt::mode::Reject;
 use graspd_rt::online::Vision;
+use graspd_rt::online::rig_watch::RigHealth;
 use graspd_rt::setpoint::SetPoint;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -31,6 +32,17 @@ pub struct Seed {
     pub left_from_gripper: Pose,
     /// Mid-exposure of the pair, CLOCK_MONOTONIC nanoseconds.
     pub capture_ns: u64,
+}
+
+/// What the newest pair says about the rig, for the status verb.
+#[derive(Clone, Copy, Debug)]
+pub struct RigSeen {
+    /// The rig as the marks show it.
+    pub rig: RigHealth,
+    /// Marks seen, left and right.
+    pub seen: [u8; 2],
+    /// Residual of the marks, pixels, and what of it the rig's error does not explain.
+    pub residual_px: [f64; 2],
 }
 
 /// Counters of the vision thread, for telemetry.
@@ -54,6 +66,8 @@ pub struct Shared {
     pub vision: Slot<Vision>,
     /// Vision to telemetry: the newest result.
     pub vision_seen: Slot<Vision>,
+    /// Vision to acquisition, which puts it in words: the rig as the newest pair shows it.
+    pub rig_seen: Slot<RigSeen>,
     /// Command to vision: joints as they were.
     pub joints: ArrayQueue<JointSample>,
     /// Acquisition to vision.
@@ -95,6 +109,7 @@ impl Default for Shared {
         Self {
             vision: Slot::default(),
             vision_seen: Slot::default(),
+            rig_seen: Slot::default(),
             joints: ArrayQueue::new(256),
             seed: Slot::default(),
             needs_seed: AtomicBool::new(true),

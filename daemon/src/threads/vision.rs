@@ -1,7 +1,7 @@
 //! The vision thread: newest pair, track, gripper pose. It owns the frame subscriber, and nothing it does can delay the arm's beat.
 
 use super::refusal::Refusal;
-use super::shared::{Seed, Shared};
+use super::shared::{RigSeen, Seed, Shared};
 use crate::config::Config;
 use crate::realtime::{Beat, now_ns};
 use crate::stop::By;
@@ -19,6 +19,9 @@ use std::sync::atomic::Ordering;
 const FROZEN_FRAMES: u32 = 5;
 /// Joint motion within the last tenth of a second that a picture has to show, rad.
 const SEEN_MOTION: f64 = 1e-3;
+
+/// Joints this much older than a pair say nothing about where the arm was then, ns: ten packages of 500 Hz.
+const JOINTS_OLD_NS: u64 = 20_000_000;
 
 /// Whether the arm moved before `at_ns`, by its encoders.
 fn moves(history: &JointHistory, at_ns: u64) -> bool {
@@ -150,13 +153,17 @@ impl<'a> VisionWorker<'a> {
             cycle.seed(moved(capture_ns, &left_from_gripper).unwrap_or(left_from_gripper));
             counters.acquired.fetch_add(1, Ordering::Relaxed);
         }
-        let base_from_gripper = history.at(middle).map(|q| dh.base_from_gripper(&q, flange_from_gripper));
+        let fresh = middle <= history.newest_ns().saturating_add(JOINTS_OLD_NS);
+        let joints = history.at(middle).filter(|_| fresh);
+        let base_from_gripper = joints.map(|q| dh.base_from_gripper(&q, flange_from_gripper));
         let pair = StereoFrame { left, right, sequence: frame.sequence(), capture_ns: capture, now_ns: now };
         match cycle.step(&pair, base_from_gripper) {
             // What the pictures say is then old, whatever their stamps say: let it age.
             Ok(_) if cycle.health().frozen_run >= FROZEN_FRAMES && moves(history, middle) => refuse(Refusal::Frozen),
             Ok(vision) => {
                 counters.frames.fetch_add(1, Ordering::Relaxed);
+                let residual_px = [vision.residual_px, vision.inner_residual_px];
+                shared.rig_seen.put(RigSeen { rig: vision.rig, seen: vision.seen, residual_px });
                 shared.vision.put(vision);
                 shared.vision_seen.put(vision);
             }

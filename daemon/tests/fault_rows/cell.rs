@@ -296,6 +296,8 @@ impl Cell {
             left_from_gripper: pose,
             covariance: Matrix6::identity() * 1e-8,
             residual_px: 0.05,
+            inner_residual_px: 0.05,
+            rig: graspd_rt::online::rig_watch::RigHealth::default(),
         };
         self.pipeline.push_back((self.now + DELAY, vision));
     }

@@ -369,6 +369,9 @@ impl CommandCycle {
         if self.arm.thin().is_some() {
             return Err(Reject::StatesMissing);
         }
+        if self.vision.rig().is_some_and(|r| r.suspicious) {
+            return Err(Reject::Settling);
+        }
         let good = self.config.settings.watch.good_ns;
         let (arm, vision) = (self.arm.good_for_ns(now), self.vision.good_for_ns(now));
         if arm.is_none_or(|t| t < good) || vision.is_none_or(|t| t < good) {

@@ -267,6 +267,9 @@ impl VisionWatch {
         if self.lost >= 2 {
             return Some(HoldCause::MarksLost);
         }
+        if self.rig.is_some_and(|r| r.suspicious) {
+            return Some(HoldCause::CameraSuspect);
+        }
         if let Some(seen) = self.seen.filter(|_| self.one_view()) {
             return Some(HoldCause::OneView { seen: seen.vision.seen });
         }

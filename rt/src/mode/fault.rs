@@ -340,6 +340,8 @@ pub enum HoldCause {
     },
     /// H-09: the operator's lease ran out (O03).
     LeaseLost,
+    /// H-13: encoders and images disagree as if a camera had moved; at rest it will be known.
+    CameraSuspect,
     /// H-12: both views are to be used and one shows too few marks: depth would come from one view, ten times as poor.
     OneView {
         /// Marks seen, left and right.
@@ -364,6 +366,7 @@ impl HoldCause {
             HoldCause::Skew { .. } => "H-08",
             HoldCause::LeaseLost => "H-09",
             HoldCause::OneView { .. } => "H-12",
+            HoldCause::CameraSuspect => "H-13",
         }
     }
 }
@@ -375,6 +378,10 @@ impl fmt::Display for HoldCause {
             HoldCause::FewPoints { points, needed } => write!(
                 f,
                 "only {points} marks are seen in the pictures in use, {needed} are needed: clear the view, then servo again"
+            ),
+            HoldCause::CameraSuspect => write!(
+                f,
+                "images and joints disagree as if a camera had been moved; if status says that one was, plan again, else servo again (often: check flange_from_gripper and the images' time stamps)"
             ),
             HoldCause::OneView { seen } => write!(
                 f,

@@ -4,6 +4,7 @@ pub mod acquire;
 mod content;
 mod frame;
 pub mod interaction;
+mod likelihood;
 pub mod marks;
 pub mod path;
 pub mod pose;

@@ -41,6 +41,11 @@ impl JointHistory {
         self.len = (self.len + 1).min(HISTORY);
     }
 
+    /// When the newest sample was taken, ns; 0 when there is none.
+    pub fn newest_ns(&self) -> u64 {
+        if self.len == 0 { 0 } else { self.newest().0 }
+    }
+
     fn newest(&self) -> &(u64, Joints) {
         &self.samples[(self.next + HISTORY - 1) % HISTORY]
     }

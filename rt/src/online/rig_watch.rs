@@ -6,13 +6,17 @@
 //! A second test, blind to the encoders, holds what no pose explains, over a window of frames, against what it was at the start: it
 //! sees steps too small for one frame, drifts, and what happened while the marks were out of sight. Both tests are one function,
 //! the gain in likelihood when the unknowns are allowed to have changed.
+//!
+//! A step makes the watch suspicious at once, which stops the arm; what it was is decided at rest, where encoders and images cannot
+//! disagree about a motion: a camera that was moved is still moved then, a disturbance is over.
 
+use super::likelihood::{STEP, free_pose, gain, scaled, scaled_score, scaled_vector, set_cross, solve, start};
 use super::pose::MarkTable;
-use super::rig_fit::{Evidence, Joint, JointVector, RigMatrix, UNKNOWNS};
+use super::rig_fit::{Evidence, Joint, JointVector, RigMatrix};
 use crate::geom::{Pose, RIG_UNKNOWNS, Rig, RigError, RigOffset, Twist, adjoint, exp_twist, log_pose};
 use crate::gripper::Gripper;
 use crate::math;
-use nalgebra::{Matrix6, SMatrix, SVector, Vector6};
+use nalgebra::{Matrix6, Vector6};
 
 /// What is expected of marks, arm and cameras, and when a change counts.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -31,8 +35,10 @@ pub struct RigWatchSettings {
     pub significant: f64,
     /// A significant change that leads the gripper astray by less than this is a warning, metres (unit-scaled). Default 0.0005.
     pub harmless_m: f64,
-    /// Frames in a row that must show a change: one alone may be a shock. Default 2.
+    /// Frames in a row that must show a change to make it suspicious: one alone may be a shock. Default 2.
     pub confirm: u32,
+    /// Frames in a row, at rest, after which it was a camera that moved. Default 12, 0.2 s.
+    pub decide: u32,
 }
 
 impl Default for RigWatchSettings {
@@ -45,6 +51,7 @@ impl Default for RigWatchSettings {
             significant: 45.0,
             harmless_m: 5e-4,
             confirm: 2,
+            decide: 12,
         }
     }
 }
@@ -54,6 +61,8 @@ impl Default for RigWatchSettings {
 pub struct RigHealth {
     /// How far off the rig seems, in deviations of its stated error (root of the sum of squares over its unknowns).
     pub offset_sigmas: f64,
+    /// Encoders and images disagree as if a camera had moved; at rest it will be known.
+    pub suspicious: bool,
     /// How many times a camera was found moved since the start. A plan is good for one such number.
     pub moves: u32,
     /// How many smaller changes were noticed, which lead the gripper astray by less than matters.
@@ -73,15 +82,14 @@ const BASE_FRAMES: u32 = 20;
 const FORGET: f64 = 2e-5;
 /// Fading of the window, frames.
 const WINDOW: f64 = 60.0;
+/// Motion from one frame to the next that is rest, metres (unit-scaled): 6 mm/s at 60 Hz.
+const REST_M: f64 = 1e-4;
+/// Motion since the last trusted frame beyond which the encoders cannot clear a suspicion any more, metres: 3 % of it are 0.6 mm.
+const UNDECIDED_M: f64 = 0.02;
+/// Motion from one frame to the next that no arm makes: the encoders jumped, and say nothing about the images.
+const ABSURD_M: f64 = 0.1;
 /// Length that makes a turn comparable with a shift, metres.
 const LENGTH: f64 = 0.1;
-/// How far a camera may be moved, one deviation, and the unit of each unknown in here: the whole rig by 10 mm and 0.6 degrees, one
-/// camera by 0.6 degrees, 0.5 % of magnification and 10 px.
-const STEP: [f64; UNKNOWNS] =
-    [1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 5e-3, 5e-3, 10.0, 10.0, 10.0, 10.0];
-/// Deviation of a pose that nothing predicts, in units of [`STEP`].
-const UNKNOWN_POSE: f64 = 30.0;
-
 /// The filter; covariances in units of [`STEP`].
 #[derive(Clone, Copy, Debug)]
 struct State {
@@ -125,6 +133,11 @@ pub struct RigWatch {
     window: Window,
     /// Frames in a row with a significant step, and with a significant window.
     suspect: [u32; 2],
+    /// Suspicious frames in a row at rest.
+    resting: u32,
+    /// Gripper in the base at the last frame, and how far the suspected step leads astray.
+    last_base: Option<Pose>,
+    astray_m: f64,
     health: RigHealth,
 }
 
@@ -137,6 +150,9 @@ impl RigWatch {
             base: None,
             window: Window::empty(),
             suspect: [0; 2],
+            resting: 0,
+            last_base: None,
+            astray_m: 0.0,
             health: RigHealth::default(),
         }
     }
@@ -156,6 +172,24 @@ impl RigWatch {
         fitted: &Pose,
         base_from_gripper: Option<&Pose>,
     ) -> RigHealth {
+        if base_from_gripper.is_none() && self.last_base.is_some() {
+            // Encoders that are silent for a while: what was known stays until they are back.
+            return self.health;
+        }
+        let moved = match (&self.last_base, base_from_gripper) {
+            (Some(then), Some(now)) => size(&log_pose(&(then.inverse() * now))),
+            _ => 0.0,
+        };
+        self.last_base = base_from_gripper.copied();
+        if moved > ABSURD_M
+            && let Some(s) = &mut self.state
+        {
+            s.pose = *fitted;
+            s.base_from_gripper = base_from_gripper.copied();
+            free_pose(&mut s.covariance);
+            self.clear();
+        }
+        self.resting = if moved < REST_M { self.resting + u32::from(self.suspect[0] > 0) } else { 0 };
         let wide = self.spread();
         let state = match self.state {
             Some(s) => self.predict(s, fitted, base_from_gripper),
@@ -169,9 +203,16 @@ impl RigWatch {
         };
         // A number that is not one, or marks that fix nothing, leave the watch as it was.
         if self.judge(rig, gripper, table, state, &wide).is_none() {
-            self.suspect = [0; 2];
+            self.clear();
         }
         self.health
+    }
+
+    /// Ends a suspicion.
+    fn clear(&mut self) {
+        self.suspect = [0; 2];
+        self.resting = 0;
+        self.health.suspicious = false;
     }
 
     /// Covariance of the stated error, in units of [`STEP`].
@@ -237,18 +278,32 @@ impl RigWatch {
         let needed = if self.suspect[0] > 0 { 0.5 } else { 1.0 };
         if self.health.evidence[0] >= needed {
             self.suspect[0] += 1;
-            if self.suspect[0] >= self.settings.confirm {
+            self.health.suspicious = self.suspect[0] >= self.settings.confirm;
+            if self.health.suspicious {
                 // What the loop would make of it: the pose that the marks alone ask for, against where the gripper is.
                 let step = scaled_vector(&step);
                 let rig_part: RigOffset = step.fixed_rows::<RIG_UNKNOWNS>(6).into_owned();
                 let pose_part: Twist = step.fixed_rows::<6>(0).into_owned();
-                let astray = size(&(pose_part + e.pose_for(&rig_part)?));
-                self.changed(astray, State { covariance: wide, ..s });
+                self.astray_m = size(&(pose_part + e.pose_for(&rig_part)?));
+                if self.resting >= self.settings.decide {
+                    self.changed(self.astray_m, State { covariance: wide, ..s });
+                }
             }
             // A frame that may be of a moved camera teaches nothing.
             return Some(());
         }
-        self.suspect[0] = 0;
+        if self.health.suspicious {
+            let trusted = self.state.and_then(|t| t.base_from_gripper);
+            let since = match (&trusted, &s.base_from_gripper) {
+                (Some(then), Some(now)) => size(&log_pose(&(then.inverse() * now))),
+                _ => 0.0,
+            };
+            if since > UNDECIDED_M {
+                self.changed(self.astray_m, State { covariance: wide, ..s });
+                return Some(());
+            }
+        }
+        (self.suspect[0], self.resting, self.health.suspicious) = (0, 0, false);
         let next = learn(s, &information, &score)?;
         self.health.offset_sigmas = self.settings.rig_error.sigmas(&next.offset);
         self.state = Some(next);
@@ -302,7 +357,7 @@ impl RigWatch {
 
     /// Notes a change, and learns anew what may have changed.
     fn changed(&mut self, astray_m: f64, mut state: State) {
-        self.suspect = [0; 2];
+        self.clear();
         self.health.astray_m = astray_m;
         if astray_m <= self.settings.harmless_m {
             // Small, and the base stays: many small changes add up against it.
@@ -317,24 +372,6 @@ impl RigWatch {
         self.base = None;
         self.window = Window::empty();
     }
-}
-
-/// Covariance at the start: a pose that nothing predicts, the stated error.
-fn start(spread: &RigMatrix) -> Joint {
-    let mut p = Joint::zeros();
-    p.fixed_view_mut::<RIG_UNKNOWNS, RIG_UNKNOWNS>(6, 6).copy_from(spread);
-    free_pose(&mut p);
-    p
-}
-
-fn free_pose(p: &mut Joint) {
-    p.fixed_view_mut::<6, 6>(0, 0).copy_from(&(Matrix6::identity() * math::sq(UNKNOWN_POSE)));
-    set_cross(p, &SMatrix::zeros());
-}
-
-fn set_cross(p: &mut Joint, cross: &SMatrix<f64, 6, RIG_UNKNOWNS>) {
-    p.fixed_view_mut::<6, RIG_UNKNOWNS>(0, 6).copy_from(cross);
-    p.fixed_view_mut::<RIG_UNKNOWNS, 6>(6, 0).copy_from(&cross.transpose());
 }
 
 /// The filter's step.
@@ -353,72 +390,4 @@ fn learn(mut s: State, information: &Joint, score: &JointVector) -> Option<State
 
 fn size(xi: &Twist) -> f64 {
     math::sqrt(xi.fixed_rows::<3>(0).norm_squared() + math::sq(LENGTH) * xi.fixed_rows::<3>(3).norm_squared())
-}
-
-fn scaled(information: &Joint) -> Joint {
-    Joint::from_fn(|i, j| information[(i, j)] * STEP[i] * STEP[j])
-}
-
-fn scaled_score(score: &JointVector) -> JointVector {
-    JointVector::from_fn(|i, _| score[i] * STEP[i])
-}
-
-/// From units of [`STEP`] to metres, radians and pixels.
-fn scaled_vector(x: &JointVector) -> JointVector {
-    JointVector::from_fn(|i, _| x[i] * STEP[i])
-}
-
-/// Chi-squared by which the unknowns explain more when their covariance is `wide` instead of `narrow`, and the unknowns then.
-fn gain<const N: usize>(
-    information: &SMatrix<f64, N, N>,
-    score: &SVector<f64, N>,
-    narrow: &SMatrix<f64, N, N>,
-    wide: &SMatrix<f64, N, N>,
-) -> Option<(f64, SVector<f64, N>)> {
-    let with = |p: &SMatrix<f64, N, N>| -> Option<SVector<f64, N>> {
-        Some(p * solve(SMatrix::<f64, N, N>::identity() + information * p, *score)?)
-    };
-    let (a, b) = (with(narrow)?, with(wide)?);
-    let chi2 = score.dot(&(b - a));
-    (chi2.is_finite() && b.iter().all(|v| v.is_finite())).then_some((chi2.max(0.0), b))
-}
-
-/// Solves `m x = b` by elimination with row pivots; `None` where a pivot is nothing or no number.
-fn solve<const N: usize, const K: usize>(
-    mut m: SMatrix<f64, N, N>,
-    mut b: SMatrix<f64, N, K>,
-) -> Option<SMatrix<f64, N, K>> {
-    for c in 0..N {
-        let mut best = c;
-        for r in c + 1..N {
-            if math::fabs(m[(r, c)]) > math::fabs(m[(best, c)]) {
-                best = r;
-            }
-        }
-        let pivot = m[(best, c)];
-        if !(math::fabs(pivot) > 1e-300 && pivot.is_finite()) {
-            return None;
-        }
-        m.swap_rows(c, best);
-        b.swap_rows(c, best);
-        for r in c + 1..N {
-            let f = m[(r, c)] / pivot;
-            for k in c + 1..N {
-                m[(r, k)] -= f * m[(c, k)];
-            }
-            for k in 0..K {
-                b[(r, k)] -= f * b[(c, k)];
-            }
-        }
-    }
-    for c in (0..N).rev() {
-        for k in 0..K {
-            let mut sum = b[(c, k)];
-            for j in c + 1..N {
-                sum -= m[(c, j)] * b[(j, k)];
-            }
-            b[(c, k)] = sum / m[(c, c)];
-        }
-    }
-    Some(b)
 }

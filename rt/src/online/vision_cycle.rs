@@ -196,7 +196,11 @@ impl VisionCycle {
         // Before anything is refused: a moved camera is what would make the rest of this look wrong.
         let moves = self.watch.health().moves;
         let pose = &solved.estimate.left_from_gripper;
-        self.watch.update(&self.rig, &self.gripper, &solved.seen, pose, base_from_gripper.as_ref());
+        self.freeze.update(frame, &table);
+        // A frozen image says nothing about the cameras, and much that is wrong beside moving encoders.
+        if self.freeze.run() == 0 {
+            self.watch.update(&self.rig, &self.gripper, &solved.seen, pose, base_from_gripper.as_ref());
+        }
         let moved = self.watch.health().moves != moves;
         if !solved.sound {
             return Ok(self.miss(frame, track));
@@ -350,7 +354,6 @@ impl VisionCycle {
         self.track =
             Some(Track { pose: e.left_from_gripper, base_from_gripper, velocity, at_ns: Some(now), misses: 0 });
         self.faults.in_a_row = 0;
-        self.freeze.update(frame, &table);
         self.health.frozen_run = self.freeze.run();
         self.health.vertical_disparity_px = self.vertical_disparity(e, &table);
         let status = self.judge(e, &velocity);

@@ -50,6 +50,8 @@ pub(crate) struct Faults {
     pub(crate) no_vision: bool,
     pub(crate) frozen_vision: bool,
     pub(crate) lost_marks: bool,
+    /// The right view shows nothing.
+    pub(crate) one_view: bool,
     pub(crate) no_state: bool,
     pub(crate) link_down: bool,
     pub(crate) echo_stuck: bool,
@@ -330,6 +332,9 @@ impl World {
             }
         }
         self.sequence += 1;
+        if self.faults.one_view {
+            marks[1] = [None; MAX_MARKS];
+        }
         let mut v = Vision {
             sequence: self.sequence,
             capture_ns: [self.now; 2],

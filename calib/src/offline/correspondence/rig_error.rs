@@ -105,7 +105,7 @@ const TYPICAL_DISTANCE: f64 = 3.0;
 /// Fewest agreeing matches that say anything: as many as the six observable parts of the error, and as many again to confirm them.
 const LEAST_AGREEING: usize = 12;
 /// Qualities of a rig that are weighed, as scales of the prior: from one as good as a pixel allows to one as bad as stated.
-const QUALITIES: [f64; 10] = [0.03, 0.045, 0.065, 0.1, 0.15, 0.22, 0.33, 0.5, 0.75, 1.1];
+const QUALITIES: [f64; 5] = [0.06, 0.12, 0.25, 0.5, 1.0];
 /// Widths of the redescending loss, pixels, from one that holds every rig of the prior to one of a few standard deviations of a match.
 const WIDTHS: [f64; 6] = [8.0, 4.0, 2.0, 1.2, 0.8, 0.6];
 /// Scatters of right matches across their lines that are weighed, pixels: patches of a clean image, of a blurred or compressed one.

@@ -35,11 +35,10 @@ pub(in crate::offline) struct Weighed {
 
 /// Prior probabilities. They matter little: a model that is right beats the others by tens of units of the logarithm, and what does not is asked about.
 ///
-/// A hand chooses the same contour in both images, but the contours offered to it include every neighbour, so that a pair is as likely unrelated as
-/// not; rims are circles far more often than ellipses.
-const UNRELATED: f64 = 0.5;
+/// A hand chooses the same contour in both images, and the contours offered to it include its neighbours; rims are circles more often than ellipses.
+const UNRELATED: f64 = 0.2;
 const OPPOSITE: f64 = 0.01;
-const ELLIPSE: f64 = 0.05;
+const ELLIPSE: f64 = 0.15;
 const CIRCLE: f64 = 1.0 - UNRELATED - OPPOSITE - ELLIPSE;
 /// Probability of what the operator has said is something else.
 const MISNAMED: f64 = 1e-3;
