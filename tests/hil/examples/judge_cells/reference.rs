@@ -79,7 +79,7 @@ impl Shape {
     fn distance(&self, s: &Matrix2<f64>, ray: &Ray) -> f64 {
         let y = self.normal.cross(&self.axis_a);
         if let Some(bar) = self.bar {
-            return self.from_core(ray, &y) - bar;
+            return self.distance_to_core(ray, &y) - bar;
         }
         let t = (self.centre - ray.eye).dot(&self.normal) / ray.way.dot(&self.normal);
         let p = ray.eye + ray.way * t - self.centre;
@@ -88,7 +88,7 @@ impl Shape {
     }
 
     /// Distance of a ray from the bar's core circle, by Newton's steps on the angle.
-    fn from_core(&self, ray: &Ray, y: &Vec3) -> f64 {
+    fn distance_to_core(&self, ray: &Ray, y: &Vec3) -> f64 {
         let radius = self.axes[0];
         let across = |v: Vec3| v - ray.way * ray.way.dot(&v);
         let t = (self.centre - ray.eye).dot(&self.normal) / ray.way.dot(&self.normal);
