@@ -13,8 +13,10 @@ mod reference;
 #[path = "../examples/judge_cells/table.rs"]
 mod table;
 
-use cell::{Cell, Click, Kind, Noise, RigError};
+use cell::{Cell, Click, Kind, Noise, RigError, TrueRim};
+use graspd_rt::geom::{Vec3, View};
 use judge::{Answer, Asked, Outcome, RimAsk};
+use reference::{POINTS, Shape, around};
 
 const KINDS: [Kind; 4] = [Kind::Paint, Kind::Thin, Kind::Torus, Kind::Ellipse];
 const CLICKS: [Click; 3] = [Click::Paint, Click::Outer, Click::Inner];
@@ -53,6 +55,36 @@ fn check(answers: &[Answer], least_right: f64) {
         "only {right} of {} plain questions answered",
         asked.len()
     );
+}
+
+/// The verdict on the same cell when its rim is said to be elsewhere.
+fn verdict(cell: &mut Cell, shape: Shape) -> Vec<&'static str> {
+    let pixels = View::BOTH.map(|v| around(POINTS).filter_map(|a| cell.true_rig.project(v, &shape.point(a))).collect());
+    cell.paint = Some(TrueRim { shape, pixels });
+    let right_rig = RigError { focal_percent: 0.0, rotation_deg: 0.0 };
+    let answers = judge::judge(cell, &[right_rig], &[Click::Paint], &[RimAsk::Edge], &Asked::default()).unwrap();
+    match &answers.first().unwrap().outcome {
+        Outcome::Planned(m) => m.wrong.clone(),
+        Outcome::Refused { text, .. } => panic!("{text}"),
+    }
+}
+
+#[test]
+fn the_judge_tells_wrong_from_right_on_both_sides_of_its_limits() {
+    let mut cell = Cell::new(Kind::Ellipse, 41, Noise::Scene).unwrap();
+    let truth = cell.paint.as_ref().unwrap().shape;
+    assert_eq!(verdict(&mut cell, truth), [""; 0]);
+    // Across the sight line, where an answer is surest of itself, and by a millimetre and a little.
+    let across = truth.centre.cross(&Vec3::y()).normalize();
+    let mut beside = truth;
+    beside.centre += across * 0.8e-3;
+    assert_eq!(verdict(&mut cell, beside), ["region"]);
+    beside.centre = truth.centre + across * 1.2e-3;
+    assert_eq!(verdict(&mut cell, beside), ["region", "centre"]);
+    let mut turned = truth;
+    turned.normal = (truth.normal + truth.axis_a * 0.7f64.to_radians()).normalize();
+    turned.axis_a = (truth.axis_a - turned.normal * turned.normal.dot(&truth.axis_a)).normalize();
+    assert!(verdict(&mut cell, turned).contains(&"normal"));
 }
 
 #[test]
