@@ -1,6 +1,6 @@
 //! The off-line stage on the simulator's pictures: from one click a view to the rim, against the truth.
 //!
-//! `GRASPD_WORLDS=100` runs more of each kind and prints the 95 % figures (`plan_worlds` and `judge_worlds` do the same from pictures on disk).
+//! `GRASPD_WORLDS=100` runs more of each kind and prints the 95 % figures (the example `judge_cells` does the same by every click, choice of rim and rig error).
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::RigFile;

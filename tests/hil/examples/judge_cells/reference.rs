@@ -79,7 +79,7 @@ impl Shape {
     fn distance(&self, s: &Matrix2<f64>, ray: &Ray) -> f64 {
         let y = self.normal.cross(&self.axis_a);
         if let Some(bar) = self.bar {
-            return self.from_core(ray, &y) - bar;
+            return self.distance_to_core(ray, &y) - bar;
         }
         let t = (self.centre - ray.eye).dot(&self.normal) / ray.way.dot(&self.normal);
         let p = ray.eye + ray.way * t - self.centre;
@@ -88,7 +88,7 @@ impl Shape {
     }
 
     /// Distance of a ray from the bar's core circle, by Newton's steps on the angle.
-    fn from_core(&self, ray: &Ray, y: &Vec3) -> f64 {
+    fn distance_to_core(&self, ray: &Ray, y: &Vec3) -> f64 {
         let radius = self.axes[0];
         let across = |v: Vec3| v - ray.way * ray.way.dot(&v);
         let t = (self.centre - ray.eye).dot(&self.normal) / ray.way.dot(&self.normal);
@@ -275,4 +275,95 @@ pub fn loop_ends(goal: &Goal, gripper: &Gripper, true_rig: &Rig) -> Option<Pose>
 /// Angles of `n` places around a rim.
 pub fn around(n: usize) -> impl Iterator<Item = f64> {
     (0..n).map(move |k| TAU * k as f64 / n as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use graspd_hil::scenario::{Options, Scenario, default_gripper};
+
+    fn rigs() -> (Rig, Rig) {
+        let options = Options { with_arm: false, focal_error: 0.005, rotation_error_deg: 0.1, ..Options::default() };
+        let s = Scenario::from_seed(3, &options).unwrap();
+        (s.true_rig, s.given_rig)
+    }
+
+    /// A rim of every kind in front of the rig, with the exact raw pixels of its edges.
+    fn shapes(rig: &Rig) -> Vec<(Shape, [Vec<Pixel>; 2])> {
+        let middle = 0.5 * rig.centre(View::Right) + Vec3::new(0.0, 0.02, 0.0);
+        let ahead = (left_axis(rig) * 1.5 + middle, (-left_axis(rig) + Vec3::new(0.1, 0.3, 0.0)).normalize());
+        let circle = Shape::circle(ahead.0, ahead.1, 0.075, None);
+        let ellipse = Shape { axes: [0.08, 0.06], ..circle };
+        let bar = Shape { bar: Some(0.012), ..circle };
+        let project = |view: View, x: Vec3| rig.project(view, &x).unwrap();
+        [circle, ellipse, bar]
+            .into_iter()
+            .map(|s| {
+                let pixels = View::BOTH.map(|v| match s.bar {
+                    None => around(POINTS).map(|a| project(v, s.point(a))).collect(),
+                    Some(_) => around(POINTS / 2)
+                        .flat_map(|a| s.outlines(&rig.centre(v), a).unwrap())
+                        .map(|x| project(v, x))
+                        .collect(),
+                });
+                (s, pixels)
+            })
+            .collect()
+    }
+
+    /// Direction from between the cameras to where their axes come together.
+    fn left_axis(rig: &Rig) -> Vec3 {
+        (Vec3::z() * 1.5 - 0.5 * rig.centre(View::Right)).normalize()
+    }
+
+    fn off(a: &Shape, b: &Shape) -> [f64; 2] {
+        [(a.centre - b.centre).norm() * 1e3, a.normal.cross(&b.normal).norm().asin().to_degrees()]
+    }
+
+    #[test]
+    fn exact_edges_and_the_true_rig_give_the_rim_back_from_a_start_beside_it() {
+        let (rig, _) = rigs();
+        for (truth, pixels) in shapes(&rig) {
+            let mut start = truth;
+            start.centre += Vec3::new(0.002, -0.003, 0.01);
+            start.normal = (truth.normal + truth.axis_a * 0.03).normalize();
+            start.axis_a = (truth.axis_a - start.normal * start.normal.dot(&truth.axis_a)).normalize();
+            start.axes = truth.axes.map(|a| a * 1.02);
+            let fit = best_fit(&start, &pixels, &rig).unwrap();
+            let [mm, deg] = off(&fit, &truth);
+            assert!(mm < 1e-4 && deg < 1e-4, "{truth:?}: {mm} mm, {deg} deg");
+            assert!((fit.axes[0] - truth.axes[0]).abs() < 1e-7 && (fit.axes[1] - truth.axes[1]).abs() < 1e-7);
+            assert!(fit.bar.zip(truth.bar).is_none_or(|(a, b)| (a - b).abs() < 1e-7));
+        }
+    }
+
+    #[test]
+    fn a_wrong_rig_has_its_share_in_depth_and_little_of_it_in_the_normal() {
+        let (rig, given) = rigs();
+        for (truth, pixels) in shapes(&rig) {
+            let [mm, deg] = off(&best_fit(&truth, &pixels, &given).unwrap(), &truth);
+            // Half a percent of focal length is 7.5 mm at 1.5 m, 0.1 degrees of rotation 7.9 mm at a baseline of 0.5 m.
+            assert!((0.3..17.0).contains(&mm) && deg < 0.5, "{truth:?}: {mm} mm, {deg} deg");
+        }
+    }
+
+    #[test]
+    fn a_loop_with_the_rig_that_predicted_the_marks_ends_at_the_goal_and_with_another_elsewhere() {
+        let (rig, given) = rigs();
+        let gripper = default_gripper().gripper;
+        let at = shapes(&rig)[0].0.pose();
+        let turn = UnitQuaternion::from_axis_angle(&Vec3::x_axis(), std::f64::consts::PI);
+        let goal_pose = at * Pose::from_parts(Vec3::new(0.0, 0.0, 0.02).into(), turn);
+        let mut goal = Goal { left_from_gripper: goal_pose, marks: Default::default() };
+        for v in View::BOTH {
+            for (slot, m) in goal.marks[v.index()].iter_mut().zip(&gripper.marks) {
+                *slot = rig.project(v, &(goal_pose * Point3::from(m.position)).coords);
+            }
+        }
+        let between = |a: &Pose, b: &Pose| (a.translation.vector - b.translation.vector).norm() * 1e3;
+        // From a start that is not yet there.
+        goal.left_from_gripper = goal_pose * Pose::translation(0.004, -0.003, 0.01);
+        assert!(between(&loop_ends(&goal, &gripper, &rig).unwrap(), &goal_pose) < 1e-5);
+        assert!(between(&loop_ends(&goal, &gripper, &given).unwrap(), &goal_pose) > 0.3);
+    }
 }

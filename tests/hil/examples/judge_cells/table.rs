@@ -114,14 +114,19 @@ fn counted(m: &BTreeMap<String, usize>) -> String {
     m.iter().map(|(k, n)| format!("{k} {n}")).collect::<Vec<_>>().join(", ")
 }
 
+/// A figure; a dash where nothing was answered.
+fn figure(x: f64, digits: usize) -> String {
+    if x.is_finite() { format!("{x:.digits$}") } else { "-".to_owned() }
+}
+
 /// The table as text, fit for a document.
 pub fn text(rows: &[Row]) -> String {
     let mut out = String::from(
-        "| cells | rig error | click | rim | n | right | other rim | refused | WRONG | centre mm 50/95/100 % | normal deg 50/95/100 % | share mm, deg | in 95 % region | loop mm 50/95 % | loop deg 50/95 % | ms 50/95 % | refusals; reasons |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+        "| cells | rig error | click | rim | n | right | other rim | refused | WRONG | centre mm 50/95/100 % | normal deg 50/95/100 % | share mm, deg | in 95 % region, % | loop mm 50/95 % | loop deg 50/95 % | ms 50/95 % | refusals; reasons |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for r in rows {
-        let [c, n] = [&r.centre_mm, &r.normal_deg].map(|v| v.map(|x| format!("{x:.2}")).join(" / "));
-        let [m, d] = [&r.loop_mm, &r.loop_deg].map(|v| v.map(|x| format!("{x:.2}")).join(" / "));
+        let [c, n] = [&r.centre_mm, &r.normal_deg].map(|v| v.map(|x| figure(x, 2)).join(" / "));
+        let [m, d] = [&r.loop_mm, &r.loop_deg].map(|v| v.map(|x| figure(x, 2)).join(" / "));
         let word = |v: &dyn std::fmt::Debug| format!("{v:?}").to_lowercase();
         let rim = match r.rim {
             RimAsk::Auto => "auto",
@@ -130,7 +135,7 @@ pub fn text(rows: &[Row]) -> String {
             RimAsk::RoundBarOfDiameter => "round-bar+d",
         };
         out += &format!(
-            "| {} | {} | {} | {rim} | {} | {} | {} | {} | {} | {c} | {n} | {:.2}, {:.2} | {:.0} %, {:.0} % | {m} | {d} | {:.0} / {:.0} | {}{}{} |\n",
+            "| {} | {} | {} | {rim} | {} | {} | {} | {} | {} | {c} | {n} | {}, {} | {}, {} | {m} | {d} | {:.0} / {:.0} | {}{}{} |\n",
             word(&r.kind),
             r.rig_error,
             word(&r.click),
@@ -139,10 +144,10 @@ pub fn text(rows: &[Row]) -> String {
             r.other,
             r.refused.values().sum::<usize>(),
             r.wrong,
-            r.share[0],
-            r.share[1],
-            r.coverage[0],
-            r.coverage[1],
+            figure(r.share[0], 2),
+            figure(r.share[1], 2),
+            figure(r.coverage[0], 0),
+            figure(r.coverage[1], 0),
             r.ms[0],
             r.ms[1],
             counted(&r.refused),

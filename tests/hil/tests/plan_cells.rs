@@ -1,0 +1,98 @@
+//! The off-line stage on a few rendered cells of every kind, by every way of asking, with right and with wrong rigs: no wrong answer.
+//!
+//! The whole table: `cargo run --release -p graspd-hil --example judge_cells`. `GRASPD_CELLS=20` judges more seeds of each kind here, and
+//! `GRASPD_FIRST_SEED=1001` others.
+#![allow(clippy::unwrap_used, unreachable_pub, dead_code)] // a test; the modules serve the example as well
+
+#[path = "../examples/judge_cells/cell.rs"]
+mod cell;
+#[path = "../examples/judge_cells/judge.rs"]
+mod judge;
+#[path = "../examples/judge_cells/reference.rs"]
+mod reference;
+#[path = "../examples/judge_cells/table.rs"]
+mod table;
+
+use cell::{Cell, Click, Kind, Noise, RigError, TrueRim};
+use graspd_rt::geom::{Vec3, View};
+use judge::{Answer, Asked, Outcome, RimAsk};
+use reference::{POINTS, Shape, around};
+
+const KINDS: [Kind; 4] = [Kind::Paint, Kind::Thin, Kind::Torus, Kind::Ellipse];
+const CLICKS: [Click; 3] = [Click::Paint, Click::Outer, Click::Inner];
+const RIMS: [RimAsk; 4] = [RimAsk::Auto, RimAsk::Edge, RimAsk::RoundBar, RimAsk::RoundBarOfDiameter];
+
+fn number(name: &str, default: u64) -> u64 {
+    std::env::var(name).ok().and_then(|v| v.parse().ok()).unwrap_or(default)
+}
+
+fn answers(error: RigError) -> Vec<Answer> {
+    let first = number("GRASPD_FIRST_SEED", 41);
+    let mut out = Vec::new();
+    for seed in first..first + number("GRASPD_CELLS", 2) {
+        for kind in KINDS {
+            let cell = Cell::new(kind, seed, Noise::Scene).unwrap();
+            out.extend(judge::judge(&cell, &[error], &CLICKS, &RIMS, &Asked::default()).unwrap());
+        }
+    }
+    println!("{}", table::text(&table::rows(&out, &KINDS, &[error], &CLICKS, &RIMS)));
+    out
+}
+
+/// None wrong, and of the questions that need no guess most answered with the rim that was meant.
+fn check(answers: &[Answer], least_right: f64) {
+    let wrong: Vec<_> = answers
+        .iter()
+        .filter(|a| matches!(&a.outcome, Outcome::Planned(m) if !m.wrong.is_empty()))
+        .map(|a| format!("{:?} {} {:?} {:?}: {:?}", a.kind, a.seed, a.click, a.rim, a.outcome))
+        .collect();
+    assert!(wrong.is_empty(), "{} wrong of {}:\n{}", wrong.len(), answers.len(), wrong.join("\n"));
+    let plain = |a: &&Answer| a.rim == RimAsk::Auto && (a.click == Click::Paint || a.kind == Kind::Torus);
+    let asked: Vec<_> = answers.iter().filter(plain).collect();
+    let right = asked.iter().filter(|a| matches!(&a.outcome, Outcome::Planned(m) if m.meant)).count();
+    assert!(
+        right as f64 >= least_right * asked.len() as f64,
+        "only {right} of {} plain questions answered",
+        asked.len()
+    );
+}
+
+/// The verdict on the same cell when its rim is said to be elsewhere.
+fn verdict(cell: &mut Cell, shape: Shape) -> Vec<&'static str> {
+    let pixels = View::BOTH.map(|v| around(POINTS).filter_map(|a| cell.true_rig.project(v, &shape.point(a))).collect());
+    cell.paint = Some(TrueRim { shape, pixels });
+    let right_rig = RigError { focal_percent: 0.0, rotation_deg: 0.0 };
+    let answers = judge::judge(cell, &[right_rig], &[Click::Paint], &[RimAsk::Edge], &Asked::default()).unwrap();
+    match &answers.first().unwrap().outcome {
+        Outcome::Planned(m) => m.wrong.clone(),
+        Outcome::Refused { text, .. } => panic!("{text}"),
+    }
+}
+
+#[test]
+fn the_judge_tells_wrong_from_right_on_both_sides_of_its_limits() {
+    let mut cell = Cell::new(Kind::Ellipse, 41, Noise::Scene).unwrap();
+    let truth = cell.paint.as_ref().unwrap().shape;
+    assert_eq!(verdict(&mut cell, truth), [""; 0]);
+    // Across the sight line, where an answer is surest of itself, and by a millimetre and a little.
+    let across = truth.centre.cross(&Vec3::y()).normalize();
+    let mut beside = truth;
+    beside.centre += across * 0.8e-3;
+    assert_eq!(verdict(&mut cell, beside), ["region"]);
+    beside.centre = truth.centre + across * 1.2e-3;
+    assert_eq!(verdict(&mut cell, beside), ["region", "centre"]);
+    let mut turned = truth;
+    turned.normal = (truth.normal + truth.axis_a * 0.7f64.to_radians()).normalize();
+    turned.axis_a = (truth.axis_a - turned.normal * turned.normal.dot(&truth.axis_a)).normalize();
+    assert!(verdict(&mut cell, turned).contains(&"normal"));
+}
+
+#[test]
+fn no_answer_is_wrong_with_a_right_rig() {
+    check(&answers(RigError { focal_percent: 0.0, rotation_deg: 0.0 }), 0.9);
+}
+
+#[test]
+fn no_answer_is_wrong_with_a_wrong_rig() {
+    check(&answers(RigError { focal_percent: 0.5, rotation_deg: 0.1 }), 0.9);
+}
