@@ -113,7 +113,7 @@ impl Report {
     pub fn images(&self) -> (String, Option<f64>) {
         let s = self.lock();
         // 0 is what nobody has noted yet.
-        let age = Some(s.image_age_ns).filter(|ns| *ns != u64::MAX && s.mode.is_some());
+        let age = Some(s.image_age_ns).filter(|ns| *ns != u64::MAX && *ns != 0);
         (s.refusal.clone(), age.map(|ns| ns as f64 * 1e-6))
     }
 

@@ -90,7 +90,7 @@ impl Service<'_> {
 
     /// A refusal in words; where the robot or the pictures are what is missing, with all that the status knows of them.
     fn refused(&self, kind: RequestKind, reject: Reject) -> String {
-        let words = advice::refusal(kind, self.report.mode().unwrap_or(ModeName::Idle), reject);
+        let words = advice::refusal(kind, self.shared.live.mode().unwrap_or(ModeName::Idle), reject);
         let mut causes: Vec<String> = self.report.lasting().into_iter().collect();
         if matches!(reject, Reject::NoMarks | Reject::Settling | Reject::WrongMode) {
             let (refusal, age_ms) = self.report.images();
@@ -238,6 +238,11 @@ impl Service<'_> {
             }
         }
     }
+}
+
+/// How long the arm may take to rest: twice the stop from full speed within the configured limits.
+pub fn ramp_limit(config: &Config) -> Duration {
+    Duration::from_secs_f64((2.0 * config.stop.time_s).clamp(0.3, 5.0))
 }
 
 /// Why a request's stamp does not allow it to be carried out; `None` where it does.

@@ -110,10 +110,7 @@ impl<'a> VisionWorker<'a> {
             counters.refusal.store(why.number(), Ordering::Relaxed);
         };
         match received.source {
-            Some(SourceEvent::First | SourceEvent::TakenOver) => {
-                cycle.reset();
-                *last = None;
-            }
+            Some(SourceEvent::First | SourceEvent::TakenOver) => cycle.reset(),
             // Which of the two shows this rig is not known any more: nothing moves by either (H06).
             Some(SourceEvent::SecondPublisher) => shared.live.stop(By::SecondPublisher),
             None => {}

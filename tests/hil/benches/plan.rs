@@ -79,9 +79,6 @@ fn main() {
             black_box([0, 1].map(|k| Arcs::link(&maps[k], &Lens::new(s.given_rig.camera(View::BOTH[k])))));
         });
         let prepared = Prepared::new(pair, &rig).unwrap();
-        time("  order of the pictures", || {
-            black_box(prepared.vote());
-        });
         time("  contours, rim model, grasp, plan (edges known)", || {
             black_box(prepared.plan(selected, &gripper, &o).ok());
         });

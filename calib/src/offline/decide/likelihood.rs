@@ -286,7 +286,7 @@ pub(in crate::offline) fn fit(hypothesis: &Hypothesis, stretches: &[Stretch], ri
         let solved = linear.solve(&sums, noise.1, noise.0)?;
         noise = (solved.kappa, solved.wave_px);
         if round >= 2 && solved.size(linear.waves) < CONVERGED {
-            let best = linear.best_noise(&sums)?;
+            let best = linear.best_noise(&sums, solved.kappa)?;
             return Some(linear.result(shapes, phi, &best, &sums, &used));
         }
         linear.advance(&mut shapes, &solved.step)?;
@@ -561,21 +561,24 @@ impl Linear {
         best
     }
 
-    /// The same for the size of the smooth error that explains the points best.
-    fn best_noise(&self, sums: &Sums) -> Option<Solved> {
-        let mut best: Option<Solved> = None;
-        let mut kappa = 1.0;
-        for wave_px in WAVE_PX {
-            // Twice from one start, so that the noise has settled when the evidence is taken.
-            let first = self.solve(sums, wave_px, kappa)?;
-            kappa = first.kappa;
-            if best.as_ref().is_none_or(|b| first.log_evidence > b.log_evidence) {
-                best = Some(first);
-            } else if best.as_ref().is_some_and(|b| first.log_evidence < b.log_evidence - 8.0) {
+    /// The same for the size of the smooth error that explains the points best: uphill from the usual one, since the evidence has one maximum.
+    fn best_noise(&self, sums: &Sums, kappa: f64) -> Option<Solved> {
+        let usual = WAVE_PX.iter().position(|w| *w >= USUAL_WAVE_PX)?;
+        let mut best = self.solve(sums, *WAVE_PX.get(usual)?, kappa)?;
+        for up in [true, false] {
+            let mut at = usual;
+            while let Some(next) = if up { Some(at + 1) } else { at.checked_sub(1) }.filter(|k| *k < WAVE_PX.len()) {
+                let there = self.solve(sums, *WAVE_PX.get(next)?, best.kappa)?;
+                if there.log_evidence <= best.log_evidence {
+                    break;
+                }
+                (at, best) = (next, there);
+            }
+            if at != usual {
                 break;
             }
         }
-        best
+        Some(best)
     }
 
     fn result(

@@ -229,7 +229,20 @@ fn bar_or_plane(
         bars.sort_by(|a, b| b.log_odds().total_cmp(&a.log_odds()));
         let Some(bar) = bars.into_iter().next() else { continue };
         let odds = bar.log_odds();
-        if let Some(e) = refused {
+        if odds > -MOST_WRONG.ln() {
+            return Ok(Some(bar_pair(bar, rig)?));
+        }
+        if odds > MOST_WRONG.ln() {
+            let differs = match (&best, bar.bar()) {
+                (Some(j), Some(b)) => j.best().is_none_or(|p| differ(&p.fitted, b, rig)),
+                _ => true,
+            };
+            if differs {
+                refused = Some(Refusal::RimAmbiguous);
+            }
+        }
+    }
+    if let Some(e) = refused {
         return Err(e);
     }
     let Some(best) = best else { return Ok(None) };
@@ -316,10 +329,12 @@ fn plane_pair(best: Judged, log_bar: f64, rig: &RigError, options: &Options) -> 
             let rig = rig.corrected(bar.phi.as_slice());
             Ok(Pair { contours: best.contours.clone(), inner: [None, None], reconstruction: r, rig, tried: best.tried })
         };
-        if odds > -MOST_WRONG.ln() {
+        // Where both lead to one grasp nothing has to be decided, and the plane rim is the simpler.
+        let differs = differ(bar, &chosen.fitted, rig);
+        if differs && odds > -MOST_WRONG.ln() {
             return alone();
         }
-        if odds > MOST_WRONG.ln() && differ(bar, &chosen.fitted, rig) {
+        if differs && odds > MOST_WRONG.ln() {
             return Err(Refusal::RimAmbiguous);
         }
     }
