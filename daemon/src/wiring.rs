@@ -245,7 +245,8 @@ fn kinematics(config: &Config, report: &Report, server: &RequestServer, live: &L
                 while let Ok(Some(request)) = server.next() {
                     let accepted = matches!(request.verb, Verb::Status | Verb::Stop);
                     let reason = "the daemon waits for the controller and cannot do that yet";
-                    request.answer(accepted, &report.json(accepted, (!accepted).then_some(reason), "", live, Value::Null));
+                    request
+                        .answer(accepted, &report.json(accepted, (!accepted).then_some(reason), "", live, Value::Null));
                 }
                 std::thread::sleep(Duration::from_millis(50));
             }

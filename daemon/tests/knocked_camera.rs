@@ -2,7 +2,6 @@
 #![cfg(feature = "demo")]
 #![allow(clippy::unwrap_used)] // a test: a failure is to be seen at once
 
-#[allow(dead_code)] // each test uses its own part of it
 mod cell;
 
 use cell::{World, ask};

@@ -284,8 +284,7 @@ const MOST_MOVE: f64 = 0.05;
 impl SeenRig {
     /// The record of a rig.
     pub fn of(rig: &Rig, epipolar_px: f64, matches: usize) -> Self {
-        let camera =
-            |c: &Camera| SeenCamera { focal_px: [c.fx, c.fy], principal_px: [c.cx, c.cy] };
+        let camera = |c: &Camera| SeenCamera { focal_px: [c.fx, c.fy], principal_px: [c.cx, c.cy] };
         Self {
             left: camera(&rig.left),
             right: camera(&rig.right),
@@ -298,9 +297,7 @@ impl SeenRig {
     /// The rig, with the lenses of the rig file; refused where it is not the rig file's rig within an error of calibration.
     fn rig(&self, src: &Source<'_>, file: &Rig) -> Result<Rig, FileError> {
         let mut out = *file;
-        for (key, seen, camera) in
-            [("left", &self.left, &mut out.left), ("right", &self.right, &mut out.right)]
-        {
+        for (key, seen, camera) in [("left", &self.left, &mut out.left), ("right", &self.right, &mut out.right)] {
             let focal = (seen.focal_px[0] / camera.fx - 1.0).abs().max((seen.focal_px[1] / camera.fy - 1.0).abs());
             let off = (seen.principal_px[0] - camera.cx).abs().max((seen.principal_px[1] - camera.cy).abs());
             for (leaf, values, good) in [

@@ -6,14 +6,14 @@ use crate::files::{
 };
 use crate::offline::contour::select::{self, Candidate, SelectError, Selection};
 use crate::offline::contour::{Contour, ViewEdges};
-use crate::offline::edges::lens::{Lens, projection};
-use crate::offline::edges::picture::Picture;
-use crate::offline::handle::grasp::{self, Approach, Grasp, GraspError, object_frame};
-use crate::offline::handle::setpoint::{RimObstacle, Scene, fewest_on_the_way};
 use crate::offline::correspondence::rig_error::{RigError, RigPrior};
 use crate::offline::correspondence::spots::{Votes, spots};
 use crate::offline::decide::pairing::{self, Pair};
 use crate::offline::decide::propose::{Proposal, propose};
+use crate::offline::edges::lens::{Lens, projection};
+use crate::offline::edges::picture::Picture;
+use crate::offline::handle::grasp::{self, Approach, Grasp, GraspError, object_frame};
+use crate::offline::handle::setpoint::{RimObstacle, Scene, fewest_on_the_way};
 use crate::offline::rim::model::{self, Reconstruction, RimModel};
 use crate::offline::rim::refusal::Refusal;
 use graspd_rt::geom::{Pose, Rig, View};
@@ -265,7 +265,10 @@ impl<'a> Prepared<'a> {
         let [l, r] = &self.edges;
         let left = select::contours(View::Left, l, selections[1], 2).ok()?;
         let right = select::contours(View::Right, r, selections[0], 2).ok()?;
-        pairing::pair([l, r], [&left, &right], &self.seen, &options.rim).err().filter(|u| u.swapped_fits).map(|u| u.refusal)
+        pairing::pair([l, r], [&left, &right], &self.seen, &options.rim)
+            .err()
+            .filter(|u| u.swapped_fits)
+            .map(|u| u.refusal)
     }
 }
 
@@ -291,13 +294,14 @@ pub(super) fn from_candidates(
     // A rim near the middle can be reconstructed either way round; the rest of the pictures tells.
     views.in_order()?;
     let (pictures, rig) = (views.pictures, views.rig);
-    let found = pairing::pair([&views.edges[0], &views.edges[1]], candidates, &views.seen, &options.rim).map_err(|u| {
-        if u.swapped_fits && !views.order().are_as_given() {
-            PlanError::Swapped { as_given: u.refusal }
-        } else {
-            PlanError::Rim(u.refusal)
-        }
-    })?;
+    let found =
+        pairing::pair([&views.edges[0], &views.edges[1]], candidates, &views.seen, &options.rim).map_err(|u| {
+            if u.swapped_fits && !views.order().are_as_given() {
+                PlanError::Swapped { as_given: u.refusal }
+            } else {
+                PlanError::Rim(u.refusal)
+            }
+        })?;
     let Pair { contours, inner, reconstruction, rig: seen, .. } = found;
     let matches = views.seen.seen;
     let grasp = grasp::choose(&seen, gripper, &reconstruction, &options.approach)?;

@@ -132,6 +132,11 @@ impl RigError {
         Self::posterior(rig, prior, &Phi::zeros(), &SMatrix::identity(), Seen::default())
     }
 
+    /// The same rig, believed as the images show it: nothing unknown is left.
+    pub fn believed(&self) -> Self {
+        Self { modes: Vec::new(), parts: Vec::new(), ..self.clone() }
+    }
+
     /// The rig with an error of so many standard deviations of each mode put right.
     pub fn corrected(&self, modes: &[f64]) -> Rig {
         let phi: Phi = self.parts.iter().zip(modes).map(|(part, v)| part * *v).sum();
@@ -172,10 +177,8 @@ impl RigError {
         let p = View::BOTH.map(|v| projection(&corrected, v));
         let by_phi = derivatives(&corrected, prior);
         let (values, vectors) = crate::offline::conic::eigen::symmetric(cov);
-        let mut parts: Vec<Phi> = (0..PARAMETERS)
-            .filter(|j| values[*j] > 0.0)
-            .map(|j| vectors.column(j) * values[j].sqrt())
-            .collect();
+        let mut parts: Vec<Phi> =
+            (0..PARAMETERS).filter(|j| values[*j] > 0.0).map(|j| vectors.column(j) * values[j].sqrt()).collect();
         let mode = |part: &Phi| -> [Projection; 2] {
             [0, 1].map(|k| by_phi.iter().zip(part.iter()).map(|(d, v)| d[k] * *v).sum())
         };
@@ -364,12 +367,7 @@ struct Row {
 
 /// Maximum a posteriori for one scatter and one quality, with its log evidence: a match is right, and scatters so much, or it is false and lies
 /// anywhere within [`SPREAD_PX`].
-fn robust(
-    rows: &[Row],
-    start: &Phi,
-    scatter: f64,
-    q: f64,
-) -> Option<(f64, Phi, SMatrix<f64, PARAMETERS, PARAMETERS>)> {
+fn robust(rows: &[Row], start: &Phi, scatter: f64, q: f64) -> Option<(f64, Phi, SMatrix<f64, PARAMETERS, PARAMETERS>)> {
     let identity = SMatrix::<f64, PARAMETERS, PARAMETERS>::identity();
     let false_density = FALSE / SPREAD_PX;
     let root = (2.0 * std::f64::consts::PI).sqrt();

@@ -4,7 +4,7 @@ use crate::offline::bar::found::BarFound;
 use crate::offline::bar::torus::Torus;
 use crate::offline::correspondence::rig_error::RigError;
 use crate::offline::decide::likelihood::{Fitted, Hypothesis, Shape, Stretch, fit};
-use crate::offline::decide::models::{Model, Weighed, prior, stretch, unrelated_px};
+use crate::offline::decide::models::{Model, UNEVEN, Weighed, prior, stretch, unrelated_px};
 use crate::offline::rim::model::{Options, Outline, RimModel};
 use crate::offline::rim::planar::{Analysis, analyse};
 
@@ -64,7 +64,7 @@ impl FourOutlines {
         if let Ok(inner) = &inner {
             let pick = |a: &Analysis, model| match model {
                 RimModel::Circle => a.circle.as_ref().ok().map(|f| Shape::Circle(f.rim)),
-                _ => a.ellipse.as_ref().ok().map(|f| Shape::Ellipse(f.rim)),
+                _ => a.ellipse.as_ref().ok().map(|f| Shape::Ellipse(f.rim, UNEVEN)),
             };
             let px = unrelated_px([&found.outer[0], &found.outer[1]]);
             for (model, kind, unrelated) in [

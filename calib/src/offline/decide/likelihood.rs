@@ -32,6 +32,8 @@ const WAVE_PX: [f64; 7] = [0.02, 0.035, 0.06, 0.1, 0.18, 0.32, 0.6];
 /// Its expected size, pixels, and how far that is off as a natural logarithm: detected edges show 0.03 to 0.15.
 const USUAL_WAVE_PX: f64 = 0.07;
 const WAVE_SPREAD: f64 = 0.7;
+/// A size of the waves that lets none through, pixels.
+const NO_WAVE_PX: f64 = 0.003;
 /// Strength of the belief that points scatter as they say (`kappa = 1`), in points.
 const NOISE_BELIEF: f64 = 6.0;
 /// A point farther from the outline than this, in its own standard deviations, is somebody else's and costs as much.
@@ -56,8 +58,8 @@ const SHAPE: usize = 8;
 pub(in crate::offline) enum Shape {
     /// A plane circle.
     Circle(Rim),
-    /// A plane ellipse.
-    Ellipse(Rim),
+    /// A plane ellipse, and how far it is from round: standard deviation of its unevenness as a fraction of its size.
+    Ellipse(Rim, f64),
     /// A round bar; and where somebody said it, its radius with the relative uncertainty of that. The fitted parameter is the radius' logarithm.
     Bar(Torus, Option<(f64, f64)>),
 }
@@ -104,28 +106,28 @@ impl Shape {
     fn parameters(&self) -> usize {
         match self {
             Self::Circle(_) => 6,
-            Self::Ellipse(_) => 8,
+            Self::Ellipse(..) => 8,
             Self::Bar(..) => 7,
         }
     }
 
     fn centre(&self) -> Vector3<f64> {
         match self {
-            Self::Circle(r) | Self::Ellipse(r) => r.centre,
+            Self::Circle(r) | Self::Ellipse(r, _) => r.centre,
             Self::Bar(t, _) => t.centre,
         }
     }
 
     fn normal(&self) -> Vector3<f64> {
         match self {
-            Self::Circle(r) | Self::Ellipse(r) => r.normal,
+            Self::Circle(r) | Self::Ellipse(r, _) => r.normal,
             Self::Bar(t, _) => t.normal,
         }
     }
 
     fn size(&self) -> f64 {
         match self {
-            Self::Circle(r) | Self::Ellipse(r) => r.a,
+            Self::Circle(r) | Self::Ellipse(r, _) => r.a,
             Self::Bar(t, _) => t.core,
         }
     }
@@ -135,12 +137,13 @@ impl Shape {
     /// a bar is.
     fn prior(&self) -> ([f64; SHAPE], [f64; SHAPE]) {
         let (reach, size) = (self.centre().norm(), self.size());
-        let mut sd = [reach, reach, reach, 1.0, 1.0, 0.5 * size, 0.25 * size, 0.25 * size];
+        let mut sd = [reach, reach, reach, 1.0, 1.0, 0.5 * size, 0.0, 0.0];
         let mut off = [0.0; SHAPE];
         match self {
             Self::Circle(_) => {}
-            Self::Ellipse(r) => {
+            Self::Ellipse(r, uneven) => {
                 let s = shape_matrix(r);
+                (sd[6], sd[7]) = (uneven * size, uneven * size);
                 off[6] = 0.5 * (s[(0, 0)] - s[(1, 1)]) / sd[6];
                 off[7] = s[(0, 1)] / sd[7];
             }
@@ -165,9 +168,9 @@ impl Shape {
         };
         Some(match self {
             Self::Circle(r) => Self::Circle(plane(Matrix2::identity() * (r.a + d[5]))?),
-            Self::Ellipse(r) => {
+            Self::Ellipse(r, uneven) => {
                 let s = shape_matrix(r) + Matrix2::new(d[5] + d[6], d[7], d[7], d[5] - d[6]);
-                Self::Ellipse(plane(s)?)
+                Self::Ellipse(plane(s)?, *uneven)
             }
             Self::Bar(t, known) => {
                 let torus = Torus { centre, normal, core: t.core + d[5], bar: t.bar * d[6].clamp(-1.0, 1.0).exp() };
@@ -179,10 +182,26 @@ impl Shape {
         })
     }
 
+    /// Natural parameters that lead from this shape to another of its kind, near it.
+    fn difference(&self, to: &Self) -> [f64; SHAPE] {
+        let f = frame_of(&self.normal());
+        let (c, n) = (to.centre() - self.centre(), to.normal() - self.normal());
+        let mut d = [c.x, c.y, c.z, f.column(0).dot(&n), f.column(1).dot(&n), to.size() - self.size(), 0.0, 0.0];
+        match (self, to) {
+            (Self::Ellipse(a, _), Self::Ellipse(b, _)) => {
+                let s = shape_matrix(b) - shape_matrix(a);
+                (d[5], d[6], d[7]) = (0.5 * (s[(0, 0)] + s[(1, 1)]), 0.5 * (s[(0, 0)] - s[(1, 1)]), s[(0, 1)]);
+            }
+            (Self::Bar(a, _), Self::Bar(b, _)) => d[6] = (b.bar / a.bar).ln(),
+            _ => {}
+        }
+        d
+    }
+
     /// Distance of points of a view from the shape's outline there, pixels.
     fn residuals(&self, points: &[EdgePoint], p: &Projection, out: &mut Vec<f64>) -> Option<()> {
         match self {
-            Self::Circle(r) | Self::Ellipse(r) => {
+            Self::Circle(r) | Self::Ellipse(r, _) => {
                 let conic = rim_conic(p, r);
                 out.extend(points.iter().map(|q| distance(&conic, &q.uv)));
             }
@@ -275,7 +294,35 @@ impl Solved {
 }
 
 /// Fits a hypothesis to contours. `None` where it leads nowhere (a shape collapses, a point has no residual).
+///
+/// A rig is either as the images of the pair show it, or it has an error of the size that they leave open; both are as likely beforehand. The
+/// evidence is that of the mixture. Where the contours do not ask for an error, the estimate is that of the rig as it is shown: an error that is not
+/// there would only let the noise of the edges into directions that a good rig determines better. The covariance is that of the unknown rig,
+/// taken about the estimate.
 pub(in crate::offline) fn fit(hypothesis: &Hypothesis, stretches: &[Stretch], rig: &RigError) -> Option<Fitted> {
+    let free = fit_rig(hypothesis, stretches, rig)?;
+    if rig.modes.is_empty() {
+        return Some(free);
+    }
+    let start = Hypothesis { shapes: free.shapes.clone(), ..hypothesis.clone() };
+    let Some(believed) = fit_rig(&start, stretches, &rig.believed()) else { return Some(free) };
+    let (a, b) = (free.log_evidence, believed.log_evidence);
+    let log_evidence = a.max(b) + (1.0 + (-(a - b).abs()).exp()).ln() - std::f64::consts::LN_2;
+    if a >= b {
+        return Some(Fitted { log_evidence, ..free });
+    }
+    let by_shape = free.shapes.first()?.difference(believed.shapes.first()?);
+    let apart = by_shape.into_iter().take(free.parameters).chain(free.phi.iter().map(|v| -v));
+    let apart = DVector::from_iterator(free.cov.nrows(), apart);
+    Some(Fitted {
+        cov: free.cov + &apart * apart.transpose(),
+        phi: DVector::zeros(rig.modes.len()),
+        log_evidence,
+        ..believed
+    })
+}
+
+fn fit_rig(hypothesis: &Hypothesis, stretches: &[Stretch], rig: &RigError) -> Option<Fitted> {
     let mut shapes = hypothesis.shapes.clone();
     let mut phi = DVector::<f64>::zeros(rig.modes.len());
     let mut noise = (1.0, USUAL_WAVE_PX);
@@ -283,8 +330,10 @@ pub(in crate::offline) fn fit(hypothesis: &Hypothesis, stretches: &[Stretch], ri
         let linear = Linear::new(hypothesis, &shapes, &phi, stretches, rig)?;
         let used = linear.used(noise, round);
         let sums = linear.sums(&used);
-        let solved = linear.solve(&sums, noise.1, noise.0)?;
-        noise = (solved.kappa, solved.wave_px);
+        // The estimate is least squares without the waves; what they would move it by goes into its covariance. On real edges, which have more to them
+        // than a few waves, it is the better of the two.
+        let solved = linear.solve(&sums, NO_WAVE_PX, noise.0)?;
+        noise = (solved.kappa, USUAL_WAVE_PX);
         if round >= 2 && solved.size(linear.waves) < CONVERGED {
             let best = linear.best_noise(&sums, solved.kappa)?;
             return Some(linear.result(shapes, phi, &best, &sums, &used));
@@ -360,7 +409,13 @@ impl Linear {
         let (sd, off) = shape.prior();
         for k in 0..shape.parameters() {
             let bar = matches!(shape, Shape::Bar(..)) && k == 6;
-            let h = if bar { 1e-4 } else if matches!(k, 3 | 4) { 1e-5 } else { 1e-5 * shape.size() };
+            let h = if bar {
+                1e-4
+            } else if matches!(k, 3 | 4) {
+                1e-5
+            } else {
+                1e-5 * shape.size()
+            };
             let mut d = [0.0; SHAPE];
             let mut side = |h: f64| -> Option<Vec<f64>> {
                 *d.get_mut(k)? = h;
@@ -386,7 +441,13 @@ impl Linear {
         let sd = [across * size, across * size, along * size, turn, turn];
         let apart = shape.centre() - first_shape.centre();
         let tipped = shape.normal() - first_shape.normal();
-        let off = [f.column(0).dot(&apart), f.column(1).dot(&apart), f.column(2).dot(&apart), f.column(0).dot(&tipped), f.column(1).dot(&tipped)];
+        let off = [
+            f.column(0).dot(&apart),
+            f.column(1).dot(&apart),
+            f.column(2).dot(&apart),
+            f.column(0).dot(&tipped),
+            f.column(1).dot(&tipped),
+        ];
         for i in first..first + points {
             let own: [f64; 5] = std::array::from_fn(|k| self.columns[(i, at + k)] / self.unit[at + k]);
             for (k, o) in own.iter().enumerate() {
@@ -394,11 +455,9 @@ impl Linear {
             }
             // Centre in the first edge's frame; the normals' frames differ by next to nothing.
             let by_centre = Vector3::new(own[0], own[1], own[2]);
-            for k in 0..3 {
-                self.columns[(i, at + k)] = by_centre.dot(&f.column(k)) * sd[k];
-            }
-            for k in 3..5 {
-                self.columns[(i, at + k)] = own[k] * sd[k];
+            for (k, sd) in sd.iter().enumerate() {
+                let by = if k < 3 { by_centre.dot(&f.column(k)) } else { own[k] };
+                self.columns[(i, at + k)] = by * sd;
             }
         }
         self.coaxial = sd;
@@ -508,9 +567,8 @@ impl Linear {
 
     fn sums(&self, used: &[bool]) -> Sums {
         let rows: Vec<usize> = used.iter().enumerate().filter(|(_, u)| **u).map(|(i, _)| i).collect();
-        let scaled = DMatrix::from_fn(rows.len(), self.columns.ncols(), |i, k| {
-            self.columns[(rows[i], k)] / self.sigma[rows[i]]
-        });
+        let scaled =
+            DMatrix::from_fn(rows.len(), self.columns.ncols(), |i, k| self.columns[(rows[i], k)] / self.sigma[rows[i]]);
         let r = DVector::from_fn(rows.len(), |i, _| self.residual[rows[i]] / self.sigma[rows[i]]);
         Sums {
             normal: scaled.tr_mul(&scaled),
@@ -581,19 +639,13 @@ impl Linear {
         Some(best)
     }
 
-    fn result(
-        &self,
-        shapes: Vec<Shape>,
-        phi: DVector<f64>,
-        solved: &Solved,
-        sums: &Sums,
-        used: &[bool],
-    ) -> Fitted {
+    fn result(&self, shapes: Vec<Shape>, phi: DVector<f64>, solved: &Solved, sums: &Sums, used: &[bool]) -> Fitted {
         let parameters = shapes.first().map_or(0, Shape::parameters);
         let modes = phi.len();
         let pick: Vec<usize> = (0..parameters).chain(self.rig..self.rig + modes).collect();
         let cov = DMatrix::from_fn(pick.len(), pick.len(), |i, j| {
-            solved.inverse[(pick[i], pick[j])] * self.unit[pick[i]] * self.unit[pick[j]]
+            let about = solved.inverse[(pick[i], pick[j])] + solved.step[pick[i]] * solved.step[pick[j]];
+            about * self.unit[pick[i]] * self.unit[pick[j]]
         });
         Fitted {
             shapes,

@@ -1,11 +1,11 @@
 //! The models that are compared for two contours, each with its evidence.
 
+use crate::offline::bar::torus::Torus;
+use crate::offline::contour::Contour;
 use crate::offline::correspondence::rig_error::RigError;
 use crate::offline::decide::likelihood::{Fitted, Hypothesis, Shape, Stretch, fit};
-use crate::offline::bar::torus::Torus;
-use crate::offline::rim::model::{Outline, RimChoice, Rim};
+use crate::offline::rim::model::{Outline, Rim, RimChoice};
 use crate::offline::rim::planar::Analysis;
-use crate::offline::contour::Contour;
 
 /// A model of some contours.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -14,6 +14,8 @@ pub(in crate::offline) enum Model {
     Circle,
     /// A plane ellipse.
     Ellipse,
+    /// A plane rim that is meant to be round and is not quite.
+    NearlyRound,
     /// A round bar.
     Bar,
     /// Two contours that have nothing to do with each other.
@@ -43,6 +45,12 @@ const CIRCLE: f64 = 1.0 - UNRELATED - OPPOSITE - ELLIPSE;
 /// Probability of what the operator has said is something else.
 const MISNAMED: f64 = 1e-3;
 
+/// Part of the round rims that are round to a hundredth only: bent, worn, or made so.
+const NEARLY: f64 = 0.2;
+/// How far an ellipse, and how far a rim that is meant to be round, is from round (see [`Shape::Ellipse`]).
+pub(in crate::offline) const UNEVEN: f64 = 0.25;
+const NEARLY_UNEVEN: f64 = 0.01;
+
 /// How far unrelated contours lie from each other, as a fraction of their semi-major axis.
 const UNRELATED_PART: f64 = 0.4;
 
@@ -52,7 +60,9 @@ pub(in crate::offline) fn prior(model: Model, choice: RimChoice) -> f64 {
         (Model::Unrelated, _) => UNRELATED,
         (Model::Opposite, _) => OPPOSITE,
         (Model::Circle, RimChoice::Ellipse) | (Model::Ellipse, RimChoice::Circle) => MISNAMED * CIRCLE,
-        (Model::Circle, _) => CIRCLE,
+        (Model::NearlyRound, RimChoice::Circle | RimChoice::Ellipse) => MISNAMED * CIRCLE,
+        (Model::NearlyRound, _) => NEARLY * CIRCLE,
+        (Model::Circle, _) => (1.0 - NEARLY) * CIRCLE,
         (Model::Ellipse, RimChoice::Ellipse) => CIRCLE,
         (Model::Ellipse, _) => ELLIPSE,
         (Model::Bar, RimChoice::RoundBar) => 1.0 - MISNAMED,
@@ -96,8 +106,9 @@ pub(in crate::offline) fn plane_models(
         weigh(Model::Circle, Shape::Circle(start), None);
     }
     if let Some(start) = ellipse.or(circle) {
-        weigh(Model::Ellipse, Shape::Ellipse(start), None);
-        weigh(Model::Unrelated, Shape::Ellipse(start), Some(unrelated_px(contours)));
+        weigh(Model::Ellipse, Shape::Ellipse(start, UNEVEN), None);
+        weigh(Model::NearlyRound, Shape::Ellipse(start, NEARLY_UNEVEN), None);
+        weigh(Model::Unrelated, Shape::Ellipse(start, UNEVEN), Some(unrelated_px(contours)));
     }
     if let Some((start, _)) = a.between {
         weigh(Model::Opposite, Shape::Circle(start), None);

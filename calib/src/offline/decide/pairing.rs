@@ -11,12 +11,10 @@ use crate::offline::contour::{Contour, ViewEdges, told_apart};
 use crate::offline::correspondence::rig_error::RigError;
 use crate::offline::decide::average::average;
 use crate::offline::decide::bars::{FourOutlines, known_radius};
-use crate::offline::decide::likelihood::{Fitted, Stretch};
+use crate::offline::decide::likelihood::{Fitted, Shape, Stretch};
 use crate::offline::decide::models::{Model, Weighed, bar_alone, plane_models, prior, probabilities, stretch};
 use crate::offline::decide::result::{apart, reconstruction};
-use crate::offline::rim::model::{
-    EdgePoint, Options, Outline, Reconstruction, RimChoice, RimModel, Score,
-};
+use crate::offline::rim::model::{EdgePoint, Options, Outline, Reconstruction, RimChoice, RimModel, Score};
 use crate::offline::rim::planar::{Analysis, analyse};
 use crate::offline::rim::reconstruct::{bar_start, tolerable_in_images};
 use crate::offline::rim::refusal::Refusal;
@@ -95,7 +93,7 @@ impl Judged {
 
     /// Probability that the contours are one plane rim.
     fn rim(&self) -> f64 {
-        self.probability(Model::Circle) + self.probability(Model::Ellipse)
+        self.probability(Model::Circle) + self.probability(Model::NearlyRound) + self.probability(Model::Ellipse)
     }
 
     fn best(&self) -> Option<&Weighed> {
@@ -123,11 +121,7 @@ impl Judged {
                 why: "the plane between the cameras carries a circle there, the one before them none",
             };
         }
-        Refusal::Different {
-            gap_px: self.analysis.gap_px,
-            probability: 1.0 - self.rim(),
-            rig_px: rig.unknown_px(),
-        }
+        Refusal::Different { gap_px: self.analysis.gap_px, probability: 1.0 - self.rim(), rig_px: rig.unknown_px() }
     }
 }
 
@@ -230,6 +224,9 @@ fn bar_or_plane(
         let Some(bar) = bars.into_iter().next() else { continue };
         let odds = bar.log_odds();
         if odds > -MOST_WRONG.ln() {
+            if is_plane(options.rim) {
+                return Err(Refusal::IsABar);
+            }
             return Ok(Some(bar_pair(bar, rig)?));
         }
         if odds > MOST_WRONG.ln() {
@@ -253,10 +250,22 @@ fn bar_or_plane(
 const SAME_CENTRE_M: f64 = 1e-3;
 const SAME_NORMAL_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
 
+/// Whether the operator has named a plane rim.
+fn is_plane(choice: RimChoice) -> bool {
+    matches!(choice, RimChoice::Edge | RimChoice::Circle | RimChoice::Ellipse)
+}
+
 /// Whether two models lead to different grasps.
 fn differ(a: &Fitted, b: &Fitted, rig: &RigError) -> bool {
     let (centre, normal) = apart(a, b, rig);
     !(centre <= SAME_CENTRE_M && normal <= SAME_NORMAL_RAD)
+}
+
+/// Thinnest bar as a fraction of its ring's radius: a thinner one is a line, and the two outlines of it are one.
+const THINNEST: f64 = 0.015;
+
+fn is_thick(bar: &Fitted) -> bool {
+    matches!(bar.shapes.first(), Some(Shape::Bar(t, _)) if t.bar >= THINNEST * t.core)
 }
 
 /// Bars with the clicked outlines.
@@ -276,7 +285,8 @@ fn look_for_bars(
     let p = [&rig.p[0], &rig.p[1]];
     let points = [0, 1].map(|k| clicked[k].edge_points(Outline::Outer));
     let start = analyse([&points[0], &points[1]], p, options).ok()?.any_rim()?;
-    let clean = best.is_some_and(|j| j.best().is_some_and(|b| b.model == Model::Circle && b.fitted.wave_px <= CLEAN_PX));
+    let clean =
+        best.is_some_and(|j| j.best().is_some_and(|b| b.model == Model::Circle && b.fitted.wave_px <= CLEAN_PX));
     let plane = (start.centre, start.normal, (start.a * start.b).sqrt());
     let search = search::find(views, clicked, plane, p, &options.tolerating_anything(), clean);
     let (seen, usual) = (search.seen.clamp(0.02, 0.98), search.usual.clamp(0.02, OTHER_OUTLINE_SEEN - 0.05));
@@ -301,7 +311,13 @@ fn bar_pair(bar: FourOutlines, rig: &RigError) -> Result<Pair, Refusal> {
     let all = [0, 1].map(|k| bar.found.points(k));
     let r = reconstruction(fitted, scores, &bar.outer, [&all[0], &all[1]], &bar.stretches, rig)?;
     let put_right = rig.corrected(fitted.phi.as_slice());
-    Ok(Pair { contours: bar.found.outer, inner: bar.found.inner.map(Some), reconstruction: r, rig: put_right, tried: 0 })
+    Ok(Pair {
+        contours: bar.found.outer,
+        inner: bar.found.inner.map(Some),
+        reconstruction: r,
+        rig: put_right,
+        tried: 0,
+    })
 }
 
 /// The plane rim, or the bar of which only the clicked outlines are seen, if one of both is out of the question.
@@ -315,7 +331,8 @@ fn plane_pair(best: Judged, log_bar: f64, rig: &RigError, options: &Options) -> 
     let lists: [&[EdgePoint]; 2] = [&points[0], &points[1]];
     let p = [&rig.p[0], &rig.p[1]];
     let bar = bar_start(lists, p, &best.analysis, options)
-        .and_then(|torus| bar_alone(contours, torus, known_radius(options), rig));
+        .and_then(|torus| bar_alone(contours, torus, known_radius(options), rig))
+        .filter(is_thick);
     if let Some(bar) = &bar {
         let odds = bar.log_evidence + log_bar - best.log_rim();
         let alone = || -> Result<Pair, Refusal> {
@@ -332,6 +349,9 @@ fn plane_pair(best: Judged, log_bar: f64, rig: &RigError, options: &Options) -> 
         // Where both lead to one grasp nothing has to be decided, and the plane rim is the simpler.
         let differs = differ(bar, &chosen.fitted, rig);
         if differs && odds > -MOST_WRONG.ln() {
+            if is_plane(options.rim) {
+                return Err(Refusal::IsABar);
+            }
             return alone();
         }
         if differs && odds > MOST_WRONG.ln() {
@@ -347,7 +367,10 @@ fn plane_pair(best: Judged, log_bar: f64, rig: &RigError, options: &Options) -> 
     // The other plane model may be right as well: the answer stays, and its covariance becomes that of both.
     for other in &best.models {
         let share = best.probability(other.model) / best.rim();
-        if matches!(other.model, Model::Circle | Model::Ellipse) && other.model != chosen.model && share > MOST_WRONG {
+        if matches!(other.model, Model::Circle | Model::NearlyRound | Model::Ellipse)
+            && other.model != chosen.model
+            && share > MOST_WRONG
+        {
             if let Ok(o) = make(other) {
                 average(&mut r, &o, share);
             }

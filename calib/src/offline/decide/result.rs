@@ -68,7 +68,7 @@ fn cov_axes(shape: &Shape, cov: &DMatrix<f64>) -> Matrix2<f64> {
             let j = Matrix2::new(1.0, 0.0, 0.0, t.bar);
             j * cov.fixed_view::<2, 2>(5, 5) * j
         }
-        Shape::Ellipse(r) => {
+        Shape::Ellipse(r, _) => {
             // In the plane's frame the axes change by v' dS v with v their directions.
             let f = frame_of(&r.normal);
             let v = Vector2::new(r.axis_a.dot(&f.column(0)), r.axis_a.dot(&f.column(1)));
@@ -80,12 +80,16 @@ fn cov_axes(shape: &Shape, cov: &DMatrix<f64>) -> Matrix2<f64> {
 }
 
 /// Stretches lie one after the other in each view.
-fn place_residuals(residuals: &mut [Vec<f64>; 2], inliers: &mut [Vec<bool>; 2], fitted: &Fitted, stretches: &[Stretch]) {
+fn place_residuals(
+    residuals: &mut [Vec<f64>; 2],
+    inliers: &mut [Vec<bool>; 2],
+    fitted: &Fitted,
+    stretches: &[Stretch],
+) {
     let mut next = [0usize; 2];
     let mut from = fitted.residuals.iter();
     for s in stretches {
-        let (Some(r), Some(u), Some(at)) =
-            (residuals.get_mut(s.view), inliers.get_mut(s.view), next.get_mut(s.view))
+        let (Some(r), Some(u), Some(at)) = (residuals.get_mut(s.view), inliers.get_mut(s.view), next.get_mut(s.view))
         else {
             continue;
         };
@@ -181,7 +185,7 @@ pub(in crate::offline) fn apart(a: &Fitted, b: &Fitted, rig: &RigError) -> (f64,
 fn rim_of(shape: &Shape) -> (RimModel, Rim, Option<f64>) {
     match shape {
         Shape::Circle(r) => (RimModel::Circle, *r, None),
-        Shape::Ellipse(r) => (RimModel::Ellipse, *r, None),
+        Shape::Ellipse(r, _) => (RimModel::Ellipse, *r, None),
         Shape::Bar(t, _) => {
             let f = frame_of(&t.normal);
             let axis_a = signed_axis(f.column(1).into_owned());

@@ -3,11 +3,11 @@
 use crate::files::{GripperFile, OrientedBox, RigFile};
 use crate::offline::contour::Contour;
 use crate::offline::contour::quick_fit::Walk;
+use crate::offline::decide::propose::Proposal;
 use crate::offline::drawing::canvas::{Canvas, Face, Rgba};
 use crate::offline::edges::lens::Lens;
 use crate::offline::edges::picture::Picture;
 use crate::offline::handle::grasp::object_frame;
-use crate::offline::decide::propose::Proposal;
 use crate::offline::plan::{Plan, model_name};
 use graspd_rt::geom::{Pixel, Pose, Vec3, View};
 use graspd_rt::setpoint::Goal;

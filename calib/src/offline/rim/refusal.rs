@@ -117,8 +117,15 @@ pub enum Refusal {
         /// Epipolar displacement that the rig may have wrong, one standard deviation, pixels.
         rig_px: f64,
     },
+    /// The operator named a plane rim, and the contours are the outlines of a round bar.
+    #[error(
+        "the contours are the outlines of a round bar, not a plane rim: leave the kind of rim open (--rim auto), or name it (--rim round-bar); as a plane rim its axis would be degrees off"
+    )]
+    IsABar,
     /// The operator named a round bar, and the outlines are not those of one.
-    #[error("the contours are not the outlines of a round bar: no bar explains them as well as a plane rim does: click an outline of the bar, or leave the kind of rim open (--rim auto)")]
+    #[error(
+        "the contours are not the outlines of a round bar: no bar explains them as well as a plane rim does: click an outline of the bar, or leave the kind of rim open (--rim auto)"
+    )]
     NotABar,
     /// What is seen of the contours is too little to tell whether they belong together.
     #[error(
