@@ -60,7 +60,7 @@ fn link_rows() -> Vec<Row> {
         row("R05", "60 ms late", Command::Delay { port: RTDE, ms: 60.0, jitter_ms: 10.0 }, Fault(&["F-ARM-02"], 24)),
         row("R06", "burst after 12 ms", Command::Hold { port: RTDE, seconds: 0.012 }, Arrives),
         row("R06", "burst after 80 ms", Command::Hold { port: RTDE, seconds: 0.08 }, Fault(&["F-ARM-02"], 24)),
-        row("R07", "single bytes", Command::Chunk { port: RTDE, bytes: 1 }, Arrives),
+        row("R07", "pieces of 16 bytes", Command::Chunk { port: RTDE, bytes: 16 }, Arrives),
         // Noise may state a package of up to 64 KiB, and then the states that follow are swallowed as its body.
         row("R08", "noise", Command::Garbage { port: RTDE, bytes: 4000 }, Fault(&["F-ARM-01", "F-ARM-02"], 24)),
         row("R08", "impossible length", Command::WrongLength { port: RTDE }, Fault(&["F-ARM-01"], 4)),

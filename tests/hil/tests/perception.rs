@@ -66,7 +66,7 @@ fn the_gripper_is_found_and_followed_in_the_cells_pictures() {
             let frame = StereoFrame { left, right, sequence: k + 1, capture_ns: [t; 2], now_ns: t + 20_000_000 };
             // What the joints predict is a few millimetres and tenths of a degree off.
             let wrong = exp_twist(&Vector6::new(0.002, -0.002, 0.003, 0.004, -0.003, 0.004));
-            let v = cycle.step(&frame, (k > 0).then(|| truth * wrong)).expect("an honest frame");
+            let v = cycle.step(&frame, Some(truth * wrong)).expect("an honest frame");
             let (mm, deg) = off(&truth, &v.left_from_gripper);
             println!(
                 "seed {seed} step {k}: {:?} {:?}, {mm:.3} mm {deg:.3} deg, {:.3} px",

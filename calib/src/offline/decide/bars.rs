@@ -93,7 +93,8 @@ impl FourOutlines {
         };
         match (best(true), best(false)) {
             (b, _) if b == f64::NEG_INFINITY => f64::NEG_INFINITY,
-            (b, f) if f == f64::NEG_INFINITY => b.abs().max(100.0),
+            // Nothing to hold it against is no evidence.
+            (_, f) if f == f64::NEG_INFINITY => 0.0,
             (b, f) => b - f,
         }
     }

@@ -286,6 +286,17 @@ struct Solved {
     wave_px: f64,
 }
 
+/// Part of each contour that a model has to explain: the rest is hidden or somebody else's.
+const EXPLAINED: f64 = 0.5;
+
+fn explains(stretches: &[Stretch], used: &[bool]) -> bool {
+    let mut next = used.iter();
+    stretches.iter().all(|s| {
+        let kept = next.by_ref().take(s.points.len()).filter(|u| **u).count();
+        kept as f64 >= EXPLAINED * s.points.len() as f64
+    })
+}
+
 impl Solved {
     /// Size of the step of shapes and rig in standard deviations.
     fn size(&self, waves: usize) -> f64 {
@@ -334,7 +345,11 @@ fn fit_rig(hypothesis: &Hypothesis, stretches: &[Stretch], rig: &RigError) -> Op
         // than a few waves, it is the better of the two.
         let solved = linear.solve(&sums, NO_WAVE_PX, noise.0)?;
         noise = (solved.kappa, USUAL_WAVE_PX);
-        if round >= 2 && solved.size(linear.waves) < CONVERGED {
+        // Directions that hardly anything determines may creep on; the last round's answer is as good as the next one's.
+        if round + 1 == ROUNDS || round >= 2 && solved.size(linear.waves) < CONVERGED {
+            if !explains(stretches, &used) {
+                return None;
+            }
             let best = linear.best_noise(&sums, solved.kappa)?;
             return Some(linear.result(shapes, phi, &best, &sums, &used));
         }

@@ -93,6 +93,10 @@ impl Judged {
 
     /// Probability that the contours are one plane rim.
     fn rim(&self) -> f64 {
+        // Nothing to hold it against is no evidence.
+        if !self.models.iter().any(|m| m.model == Model::Unrelated) {
+            return 0.0;
+        }
         self.probability(Model::Circle) + self.probability(Model::NearlyRound) + self.probability(Model::Ellipse)
     }
 

@@ -55,7 +55,7 @@ pub struct Asked {
 
 impl Default for Asked {
     fn default() -> Self {
-        Self { tolerance_mm: 1.0, tolerance_deg: 0.5, calibration_px: None }
+        Self { tolerance_mm: 2.0, tolerance_deg: 1.0, calibration_px: None }
     }
 }
 
