@@ -179,10 +179,10 @@ pub struct PlanArgs {
     /// Distance of the grasp pose from the object's plane, metres
     #[arg(long, value_name = "M", default_value_t = 0.0, allow_hyphen_values = true)]
     pub standoff: f64,
-    /// Uncertainty of the place that the task tolerates (one sigma), millimetres [default: 1, for a mesh 3]
+    /// Uncertainty of the place that the task tolerates (one sigma), millimetres [default: 2, for a mesh 3]
     #[arg(long, value_name = "MM")]
     pub tolerance_mm: Option<f64>,
-    /// Uncertainty of the axis that the task tolerates (one sigma), degrees [default: 0.5, for a mesh 2]
+    /// Uncertainty of the axis that the task tolerates (one sigma), degrees [default: 1, for a mesh 2]
     #[arg(long, value_name = "DEG")]
     pub tolerance_deg: Option<f64>,
     /// Where the gripper is now in the left camera's frame: a pose file, or X,Y,Z,RX,RY,RZ (metres, rotation vector in
@@ -192,7 +192,7 @@ pub struct PlanArgs {
     /// Largest turn from the present pose, degrees
     #[arg(long, value_name = "DEG", requires = "present")]
     pub max_turn: Option<f64>,
-    /// Allowance for the rig's calibration error in the two-view test, pixels
+    /// Epipolar displacement that the rig file may have wrong, pixels (one sigma) [default: the rig file's stated quality]
     #[arg(long, value_name = "PX")]
     pub calibration_px: Option<f64>,
     /// Where to write the plan

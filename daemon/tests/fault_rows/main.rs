@@ -378,7 +378,7 @@ fn a_link_that_ends_says_why() {
 fn kinematics_that_are_not_the_arms_are_noticed_by_the_controllers_own_speed() {
     let tool = Command::Tcp { pose: [0.02, -0.03, 0.17, 0.1, 0.2, -0.3] };
     for (times, noticed) in [(0.8, true), (1.25, true), (1.0, false)] {
-        let mut cell = Cell::start(&[tool.clone()], |_| {}).unwrap();
+        let mut cell = Cell::start(std::slice::from_ref(&tool), |_| {}).unwrap();
         cell.mistake_lengths(times);
         cell.run(600);
         assert_eq!(cell.ask_servo(), Ok(()), "{times}");

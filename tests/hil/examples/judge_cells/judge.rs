@@ -151,7 +151,12 @@ pub fn judge(
         let paint = cell.paint.as_ref().map(target).transpose()?;
         let bar = cell.bar.as_ref().map(target).transpose()?;
         let before = processor_ms();
-        let prepared = Prepared::new([&cell.images[0], &cell.images[1]], &file).map_err(|e| e.to_string())?;
+        let prepared = Prepared::with_prior(
+            [&cell.images[0], &cell.images[1]],
+            &file,
+            &PlanOptions { calibration_px: asked.calibration_px, ..PlanOptions::default() }.prior(&file),
+        )
+        .map_err(|e| e.to_string())?;
         prepared.order();
         let preparing = processor_ms() - before;
         for &click in clicks {
@@ -192,7 +197,7 @@ fn options(cell: &Cell, rim: RimAsk, asked: &Asked) -> Option<PlanOptions> {
     o.rim.max_sigma_centre = Some(asked.tolerance_mm * 1e-3);
     o.rim.max_sigma_normal = asked.tolerance_deg.to_radians();
     if let Some(px) = asked.calibration_px {
-        o.rim.calibration_px = px;
+        o.calibration_px = Some(px);
     }
     Some(o)
 }
