@@ -6,7 +6,7 @@ use crate::offline::conic::levenberg::{self, Linear, Problem};
 use crate::offline::rim::circle::frame_of;
 use crate::offline::rim::cone::camera_centre;
 use crate::offline::rim::model::{EdgePoint, Projection};
-use nalgebra::{SMatrix, SVector, Vector3};
+use nalgebra::{SMatrix, SVector, Vector2, Vector3};
 use std::cell::RefCell;
 
 /// A torus: core circle and bar.
@@ -65,6 +65,8 @@ struct Closest {
     distance: f64,
     /// Change of the distance per pixel.
     slope: f64,
+    /// Direction of that change in the image.
+    gradient: Vector2<f64>,
 }
 
 /// Axes of a torus' plane.
@@ -118,7 +120,16 @@ impl Torus {
         let depth = ray.direction.dot(&core);
         let (u, v) = (w.dot(&ray.per_pixel[0]), w.dot(&ray.per_pixel[1]));
         let slope = depth * (u * u + v * v).sqrt();
-        (distance > 0.0 && slope > 0.0 && slope.is_finite()).then_some(Closest { e, w, distance, slope })
+        let gradient = Vector2::new(u, v) * (depth / slope);
+        (distance > 0.0 && slope > 0.0 && slope.is_finite()).then_some(Closest { e, w, distance, slope, gradient })
+    }
+
+    /// How far a ray's edge point is from the outline, pixels, in which direction of the image that grows, and the bar's point that the ray
+    /// comes closest to.
+    pub(crate) fn touch(&self, ray: &Ray) -> Option<(f64, Vector2<f64>, Vector3<f64>)> {
+        let c = self.closest(ray, &self.axes())?;
+        let foot = self.centre + c.e * self.core + c.w * self.bar;
+        Some(((c.distance - self.bar) / c.slope, c.gradient, foot))
     }
 
     /// Residual of a ray in pixels: how far the edge point is from the outline, positive away from the bar.

@@ -81,6 +81,10 @@ pub struct RigError {
     /// The same parts as errors of the rig.
     parts: Vec<Phi>,
     prior: RigPrior,
+    /// The rig file as it was given, in units of the modes, and the logarithm of the odds that it is right as it stands against the rest.
+    given: Vec<f64>,
+    /// See [`RigError::log_odds_given`].
+    log_odds: f64,
     /// What the matches said.
     pub seen: Seen,
 }
@@ -105,7 +109,7 @@ const TYPICAL_DISTANCE: f64 = 3.0;
 /// Fewest agreeing matches that say anything: as many as the six observable parts of the error, and as many again to confirm them.
 const LEAST_AGREEING: usize = 12;
 /// Qualities of a rig that are weighed, as scales of the prior: from one as good as a pixel allows to one as bad as stated.
-const QUALITIES: [f64; 5] = [0.06, 0.12, 0.25, 0.5, 1.0];
+const QUALITIES: [f64; 6] = [0.03, 0.06, 0.12, 0.25, 0.5, 1.0];
 /// Widths of the redescending loss, pixels, from one that holds every rig of the prior to one of a few standard deviations of a match.
 const WIDTHS: [f64; 6] = [8.0, 4.0, 2.0, 1.2, 0.8, 0.6];
 /// Scatters of right matches across their lines that are weighed, pixels: patches of a clean image, of a blurred or compressed one.
@@ -124,17 +128,31 @@ impl RigError {
     pub fn none(rig: &Rig) -> Self {
         let p = View::BOTH.map(|v| projection(rig, v));
         let prior = RigPrior::none();
-        Self { rig: *rig, p, modes: Vec::new(), parts: Vec::new(), prior, seen: Seen::default() }
+        let (modes, parts, given) = (Vec::new(), Vec::new(), Vec::new());
+        Self { rig: *rig, p, modes, parts, prior, given, log_odds: 0.0, seen: Seen::default() }
     }
 
     /// What the prior alone says.
     pub fn prior(rig: &Rig, prior: &RigPrior) -> Self {
-        Self::posterior(rig, prior, &Phi::zeros(), &SMatrix::identity(), Seen::default())
+        let found = Mixture { mean: Phi::zeros(), cov: SMatrix::identity(), scatter: 0.0, log_odds: 0.0 };
+        Self::posterior(rig, prior, &found, Seen::default())
     }
 
-    /// The same rig, believed as the images show it: nothing unknown is left.
-    pub fn believed(&self) -> Self {
-        Self { modes: Vec::new(), parts: Vec::new(), ..self.clone() }
+    /// The rig file believed to the letter, whatever the matches say.
+    pub fn as_given(&self) -> Self {
+        let put_right = |k: usize| self.p[k] + self.modes.iter().zip(&self.given).map(|(m, v)| m[k] * *v).sum::<Projection>();
+        Self { p: [put_right(0), put_right(1)], modes: Vec::new(), parts: Vec::new(), ..self.clone() }
+    }
+
+    /// The rig file as it was given, in units of the modes.
+    pub fn given(&self) -> &[f64] {
+        &self.given
+    }
+
+    /// Logarithm of the odds by the matches that the rig file is right as it stands, against an error of the prior's size or less; as likely
+    /// as the other beforehand.
+    pub fn log_odds_given(&self) -> f64 {
+        self.log_odds
     }
 
     /// The rig with an error of so many standard deviations of each mode put right.
@@ -169,14 +187,13 @@ impl RigError {
     fn posterior(
         rig: &Rig,
         prior: &RigPrior,
-        mean: &Phi,
-        cov: &SMatrix<f64, PARAMETERS, PARAMETERS>,
+        found: &Mixture,
         seen: Seen,
     ) -> Self {
-        let corrected = prior.corrected(rig, mean);
+        let corrected = prior.corrected(rig, &found.mean);
         let p = View::BOTH.map(|v| projection(&corrected, v));
         let by_phi = derivatives(&corrected, prior);
-        let (values, vectors) = crate::offline::conic::eigen::symmetric(cov);
+        let (values, vectors) = crate::offline::conic::eigen::symmetric(&found.cov);
         let mut parts: Vec<Phi> =
             (0..PARAMETERS).filter(|j| values[*j] > 0.0).map(|j| vectors.column(j) * values[j].sqrt()).collect();
         let mode = |part: &Phi| -> [Projection; 2] {
@@ -184,7 +201,8 @@ impl RigError {
         };
         parts.retain(|part| mode(part).iter().any(|m| m.norm() > 0.0));
         let modes = parts.iter().map(mode).collect();
-        Self { rig: corrected, p, modes, parts, prior: *prior, seen }
+        let given = parts.iter().map(|part| -part.dot(&found.mean) / part.norm_squared()).collect();
+        Self { rig: corrected, p, modes, parts, prior: *prior, given, log_odds: found.log_odds, seen }
     }
 
     /// What the prior and the matches of a pair of images say together: maximum a posteriori under a redescending loss that starts wide
@@ -230,7 +248,7 @@ impl RigError {
         if !seen.is_significant(3.0 * found.scatter) {
             return Self { seen, ..Self::prior(rig, prior) };
         }
-        Self::posterior(rig, prior, &found.mean, &found.cov, seen)
+        Self::posterior(rig, prior, &found, seen)
     }
 }
 
@@ -319,6 +337,8 @@ impl<'a> Epipolar<'a> {
         }
         let most = each.iter().map(|e| e.0).fold(f64::NEG_INFINITY, f64::max);
         let total: f64 = each.iter().map(|e| (e.0 - most).exp()).sum();
+        let exact: f64 = SCATTERS_PX.iter().map(|s| (right_or_false(&rows, &Phi::zeros(), *s) - most).exp()).sum();
+        let log_odds = exact.ln() - (total / QUALITIES.len() as f64).ln();
         let share = |log: f64| (log - most).exp() / total;
         let mean: Phi = each.iter().map(|(l, _, m, _)| m * share(*l)).sum();
         let scatter = each.iter().map(|(l, s, _, _)| s * share(*l)).sum();
@@ -326,7 +346,7 @@ impl<'a> Epipolar<'a> {
         for (l, _, m, c) in &each {
             cov += (c + (m - mean) * (m - mean).transpose()) * share(*l);
         }
-        mean.iter().chain(cov.iter()).all(|v| v.is_finite()).then_some(Mixture { mean, cov, scatter })
+        mean.iter().chain(cov.iter()).all(|v| v.is_finite()).then_some(Mixture { mean, cov, scatter, log_odds })
     }
 
     /// Gauss-Newton step towards the maximum a posteriori for given weights, and the covariance there.
@@ -351,11 +371,12 @@ impl<'a> Epipolar<'a> {
     }
 }
 
-/// Mean and covariance of the error, and the scatter of right matches, pixels.
+/// Mean and covariance of the error, the scatter of right matches, pixels, and the logarithm of the odds of no error at all.
 struct Mixture {
     mean: Phi,
     cov: SMatrix<f64, PARAMETERS, PARAMETERS>,
     scatter: f64,
+    log_odds: f64,
 }
 
 /// A match in the linear model: distance from its line at zero error, the distance's slope, and what the match itself is off by.
@@ -365,12 +386,26 @@ struct Row {
     sigma: f64,
 }
 
+/// Probability densities of a match that is right, and of one that is false, where it lies `t` standard deviations `s` from its line.
+fn densities(t: f64, s: f64) -> (f64, f64) {
+    let root = (2.0 * std::f64::consts::PI).sqrt();
+    ((1.0 - FALSE) / (s * root) * (-0.5 * t * t).exp(), FALSE / SPREAD_PX)
+}
+
+/// Log likelihood of the matches for an error.
+fn right_or_false(rows: &[Row], at: &Phi, scatter: f64) -> f64 {
+    let each = rows.iter().map(|row| {
+        let s = scatter.hypot(row.sigma);
+        let (right, wrong) = densities((row.residual + row.slope.dot(at)) / s, s);
+        (right + wrong).ln()
+    });
+    WEIGHT * each.sum::<f64>()
+}
+
 /// Maximum a posteriori for one scatter and one quality, with its log evidence: a match is right, and scatters so much, or it is false and lies
 /// anywhere within [`SPREAD_PX`].
 fn robust(rows: &[Row], start: &Phi, scatter: f64, q: f64) -> Option<(f64, Phi, SMatrix<f64, PARAMETERS, PARAMETERS>)> {
     let identity = SMatrix::<f64, PARAMETERS, PARAMETERS>::identity();
-    let false_density = FALSE / SPREAD_PX;
-    let root = (2.0 * std::f64::consts::PI).sqrt();
     let mut at = *start;
     let mut found = None;
     for _ in 0..12 {
@@ -378,9 +413,9 @@ fn robust(rows: &[Row], start: &Phi, scatter: f64, q: f64) -> Option<(f64, Phi, 
         for Row { residual: r0, slope: j, sigma } in rows {
             let s = scatter.hypot(*sigma);
             let t = (r0 + j.dot(&at)) / s;
-            let right = (1.0 - FALSE) / (s * root) * (-0.5 * t * t).exp();
-            log += WEIGHT * (right + false_density).ln();
-            let w = WEIGHT * right / (right + false_density) / (s * s);
+            let (right, wrong) = densities(t, s);
+            log += WEIGHT * (right + wrong).ln();
+            let w = WEIGHT * right / (right + wrong) / (s * s);
             if w > 1e-9 {
                 n += j * j.transpose() * w;
                 b -= j * (r0 * w);

@@ -48,10 +48,10 @@ struct Args {
     #[arg(long, value_enum, default_value = "scene")]
     noise: Noise,
     /// Tolerance of the centre, mm (one sigma)
-    #[arg(long, default_value_t = 1.0)]
+    #[arg(long, default_value_t = 2.0)]
     tolerance_mm: f64,
     /// Tolerance of the normal, degrees (one sigma)
-    #[arg(long, default_value_t = 0.5)]
+    #[arg(long, default_value_t = 1.0)]
     tolerance_deg: f64,
     /// The rig's stated calibration error, pixels [default: the planner's]
     #[arg(long)]

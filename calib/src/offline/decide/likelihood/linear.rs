@@ -1,0 +1,190 @@
+//! The linear model of all edge points at one state: how each residual changes with the shapes, the rig and a displacement of unrelated
+//! contours.
+
+use super::shape::{Place, SHAPE};
+use super::{Hypothesis, OUTLIER_SIGMAS, Shape, Stretch, corrected, solve};
+use crate::offline::conic::robust::median;
+use crate::offline::correspondence::rig_error::RigError;
+use crate::offline::rim::circle::frame_of;
+use crate::offline::rim::cone::camera_centre;
+use crate::offline::rim::model::Projection;
+use nalgebra::{DMatrix, DVector, Vector2, Vector3};
+
+/// How far the second edge of a flat ring lies from coaxial with the first: across and along the axis as a fraction of the radius, and in
+/// direction, radians.
+const COAXIAL: [f64; 3] = [0.005, 0.05, 0.005];
+/// How far the radius of the second edge differs from the first, as a fraction of it: what a bar's diameter may be.
+const RING_WIDTH: f64 = 0.15;
+
+/// Residuals and columns of the linear model, at one state.
+pub(super) struct Linear {
+    /// A row a point: shapes, rig, displacement of unrelated contours; in units of each parameter's prior.
+    pub(super) columns: DMatrix<f64>,
+    /// Where each point lies about its outline.
+    pub(super) places: Vec<Place>,
+    /// Standard deviation of each point, pixels.
+    pub(super) sigma: Vec<f64>,
+    /// Unit of each column's parameter, and the present value in it.
+    pub(super) unit: Vec<f64>,
+    pub(super) offset: Vec<f64>,
+    /// Units of a second shape's place and direction, relative to the first.
+    coaxial: [f64; 5],
+    /// First column of the rig.
+    pub(super) rig: usize,
+}
+
+impl Linear {
+    pub(super) fn new(
+        hypothesis: &Hypothesis,
+        shapes: &[Shape],
+        phi: &DVector<f64>,
+        stretches: &[Stretch],
+        rig: &RigError,
+    ) -> Option<Self> {
+        let count: usize = stretches.iter().map(|s| s.points.len()).sum();
+        let by_shape: usize = shapes.iter().map(Shape::parameters).sum();
+        let apart = if hypothesis.unrelated_px.is_some() { 2 * shapes.len() } else { 0 };
+        let (first_rig, first_apart) = (by_shape, by_shape + rig.modes.len());
+        let width = first_apart + apart;
+        let mut out = Self {
+            columns: DMatrix::zeros(count, width),
+            places: Vec::with_capacity(count),
+            sigma: stretches.iter().flat_map(|s| s.points.iter().map(|q| q.sigma)).collect(),
+            unit: vec![1.0; width],
+            offset: vec![0.0; width],
+            coaxial: [0.0; 5],
+            rig: first_rig,
+        };
+        out.offset.iter_mut().skip(first_rig).zip(phi.iter()).for_each(|(o, p)| *o = *p);
+        let p = [0, 1].map(|k| corrected(rig, phi, k));
+        for s in stretches {
+            let shape = shapes.get(s.shape)?;
+            let camera = p.get(s.view)?;
+            let at: usize = shapes.iter().take(s.shape).map(Shape::parameters).sum();
+            let first = out.places.len();
+            out.places.extend(shape.places(&s.points, camera)?);
+            out.by_shape_and_rig(shape, s.view, camera, rig, at, first);
+            if s.shape > 0 {
+                out.coaxial(shapes.first()?, shape, s.points.len(), at, first);
+            }
+            if let Some(px) = hypothesis.unrelated_px.filter(|_| s.view == 1) {
+                out.by_displacement(s, &p, px, first_apart + 2 * s.shape, first)?;
+            }
+        }
+        let finite = out.places.iter().all(|r| r.residual.is_finite()) && out.columns.iter().all(|c| c.is_finite());
+        finite.then_some(out)
+    }
+
+    fn by_shape_and_rig(&mut self, shape: &Shape, view: usize, p: &Projection, rig: &RigError, at: usize, first: usize) {
+        let (sd, off) = shape.prior();
+        for k in 0..shape.parameters() {
+            self.unit[at + k] = sd[k];
+            self.offset[at + k] = off[k];
+        }
+        for i in first..self.places.len() {
+            let place = self.places[i];
+            let moves = shape.moves(&place.foot);
+            for k in 0..shape.parameters() {
+                self.columns[(i, at + k)] = place.by_motion(&moves[k], p) * sd[k];
+            }
+            for (j, mode) in rig.modes.iter().enumerate() {
+                let change = if view == 0 { &mode[0] } else { &mode[1] };
+                self.columns[(i, self.rig + j)] = place.by_camera(change, p);
+            }
+        }
+    }
+
+    /// The second edge of a ring goes with the first: its own place and direction are those relative to it.
+    fn coaxial(&mut self, first_shape: &Shape, shape: &Shape, points: usize, at: usize, first: usize) {
+        let f = frame_of(&first_shape.normal());
+        let [across, along, turn] = COAXIAL;
+        let size = first_shape.size();
+        let sd = [across * size, across * size, along * size, turn, turn];
+        let apart = shape.centre() - first_shape.centre();
+        let tipped = shape.normal() - first_shape.normal();
+        let off = [
+            f.column(0).dot(&apart),
+            f.column(1).dot(&apart),
+            f.column(2).dot(&apart),
+            f.column(0).dot(&tipped),
+            f.column(1).dot(&tipped),
+        ];
+        for i in first..first + points {
+            let own: [f64; 5] = std::array::from_fn(|k| self.columns[(i, at + k)] / self.unit[at + k]);
+            for (k, o) in own.iter().enumerate() {
+                self.columns[(i, k)] = o * self.unit[k];
+            }
+            // Centre in the first edge's frame; the normals' frames differ by next to nothing.
+            let by_centre = Vector3::new(own[0], own[1], own[2]);
+            for (k, sd) in sd.iter().enumerate() {
+                let by = if k < 3 { by_centre.dot(&f.column(k)) } else { own[k] };
+                self.columns[(i, at + k)] = by * sd;
+            }
+        }
+        self.coaxial = sd;
+        // Radius and shape follow the first edge's within the width of a ring.
+        let narrow = RING_WIDTH * size / self.unit[at + 5];
+        if narrow < 1.0 {
+            for i in first..first + points {
+                self.columns[(i, at + 5)] *= narrow;
+            }
+            self.unit[at + 5] *= narrow;
+        }
+        for k in 0..5 {
+            self.offset[at + k] = off[k] / sd[k];
+        }
+    }
+
+    /// Another contour than the left one's lies elsewhere across the epipolar lines, and is of another height over them.
+    fn by_displacement(&mut self, s: &Stretch, p: &[Projection; 2], px: f64, at: usize, first: usize) -> Option<()> {
+        let middle = s.points.iter().map(|q| q.uv).sum::<Vector2<f64>>() / s.points.len().max(1) as f64;
+        let epipole = p[1] * camera_centre(&p[0])?.push(1.0);
+        let line = epipole.cross(&middle.push(1.0));
+        let across = Vector2::new(line.x, line.y).try_normalize(0.0)?;
+        let spread = s.points.iter().map(|q| across.dot(&(q.uv - middle)).powi(2)).sum::<f64>();
+        let spread = (spread / s.points.len().max(1) as f64).sqrt().max(1e-9);
+        for (i, q) in s.points.iter().enumerate() {
+            let by = self.places.get(first + i)?.gradient.dot(&across) * px;
+            self.columns[(first + i, at)] = by;
+            self.columns[(first + i, at + 1)] = by * across.dot(&(q.uv - middle)) / spread;
+        }
+        Some(())
+    }
+
+    /// Moves the shapes by a step.
+    pub(super) fn advance(&self, shapes: &mut [Shape], step: &DVector<f64>) -> Option<()> {
+        let frame = frame_of(&shapes.first()?.normal());
+        let (mut at, mut first) = (0, [0.0; SHAPE]);
+        for (n, s) in shapes.iter_mut().enumerate() {
+            let mut d = [0.0; SHAPE];
+            d.iter_mut().enumerate().take(s.parameters()).for_each(|(k, d)| *d = step[at + k] * self.unit[at + k]);
+            if n > 0 {
+                let own: [f64; 5] = std::array::from_fn(|k| step[at + k] * self.coaxial[k]);
+                let place = frame * Vector3::new(own[0], own[1], own[2]);
+                for k in 0..3 {
+                    d[k] = first[k] + place[k];
+                }
+                for k in 3..5 {
+                    d[k] = first[k] + own[k];
+                }
+            } else {
+                first = d;
+            }
+            // A step beyond the linear range is cut; the next round goes on from there.
+            let far = (d[0].hypot(d[1]).hypot(d[2]) / s.size()).max(d[3].hypot(d[4])).max(d[5].abs() / s.size());
+            let cut = if far > 0.3 { 0.3 / far } else { 1.0 };
+            at += s.parameters();
+            *s = s.moved(&d.map(|x| x * cut))?;
+        }
+        Some(())
+    }
+
+    /// Points that belong to the outline, as far as the present fit can say: the first fit believes the rig and is off as a whole.
+    pub(super) fn used(&self, kappa: f64, round: usize) -> Vec<bool> {
+        let each = || self.places.iter().zip(&self.sigma).map(|(p, s)| (p.residual.abs(), *s));
+        let scale = 1.48 * median(each().map(|(r, s)| r / s).collect());
+        let scale = if round == 0 { scale.max(1.0) } else { scale.max(kappa) };
+        let smooth = 2.0 * solve::USUAL_WAVE_PX;
+        each().map(|(r, s)| r <= OUTLIER_SIGMAS * (scale * s).hypot(smooth)).collect()
+    }
+}

@@ -1,0 +1,238 @@
+//! What contours may be pictures of: a plane circle or ellipse, a round bar; where their outlines lie, and how parameters move them.
+
+use crate::offline::bar::torus::{Torus, rays};
+use crate::offline::conic::sampson::distance;
+use crate::offline::conic::{image_of_unit_circle, orient};
+use crate::offline::rim::circle::{frame_of, signed_axis};
+use crate::offline::rim::model::{EdgePoint, Projection, Rim};
+use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
+
+/// Usual radius of a bar as a fraction of its ring's, and how far bars differ from it, as a natural logarithm: hand wheels, handles and pipes
+/// lie between a thirtieth and a half.
+const USUAL_BAR: f64 = 0.12;
+const BAR_SPREAD: f64 = 0.6;
+/// Parameters of a shape at most.
+pub(super) const SHAPE: usize = 8;
+
+/// What a set of contours is a picture of.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(in crate::offline) enum Shape {
+    /// A plane circle.
+    Circle(Rim),
+    /// A plane ellipse, and how far it is from round: standard deviation of its unevenness as a fraction of its size.
+    Ellipse(Rim, f64),
+    /// A round bar; and where somebody said it, its radius with the relative uncertainty of that. The fitted parameter is the radius' logarithm.
+    Bar(Torus, Option<(f64, f64)>),
+}
+
+impl Shape {
+    pub(super) fn parameters(&self) -> usize {
+        match self {
+            Self::Circle(_) => 6,
+            Self::Ellipse(..) => 8,
+            Self::Bar(..) => 7,
+        }
+    }
+
+    pub(super) fn centre(&self) -> Vector3<f64> {
+        match self {
+            Self::Circle(r) | Self::Ellipse(r, _) => r.centre,
+            Self::Bar(t, _) => t.centre,
+        }
+    }
+
+    pub(super) fn normal(&self) -> Vector3<f64> {
+        match self {
+            Self::Circle(r) | Self::Ellipse(r, _) => r.normal,
+            Self::Bar(t, _) => t.normal,
+        }
+    }
+
+    pub(super) fn size(&self) -> f64 {
+        match self {
+            Self::Circle(r) | Self::Ellipse(r, _) => r.a,
+            Self::Bar(t, _) => t.core,
+        }
+    }
+
+    /// Standard deviation of each parameter before anything is seen, natural units, and how far the present value is from the prior's mean
+    /// in them. Place and direction are as good as free; what tells models from each other is how far an ellipse is from round and how thick
+    /// a bar is.
+    pub(super) fn prior(&self) -> ([f64; SHAPE], [f64; SHAPE]) {
+        let (reach, size) = (self.centre().norm(), self.size());
+        let mut sd = [reach, reach, reach, 1.0, 1.0, 0.5 * size, 0.0, 0.0];
+        let mut off = [0.0; SHAPE];
+        match self {
+            Self::Circle(_) => {}
+            Self::Ellipse(r, uneven) => {
+                let s = shape_matrix(r);
+                (sd[6], sd[7]) = (uneven * size, uneven * size);
+                off[6] = 0.5 * (s[(0, 0)] - s[(1, 1)]) / sd[6];
+                off[7] = s[(0, 1)] / sd[7];
+            }
+            Self::Bar(t, known) => {
+                let (mean, spread) = known.unwrap_or((USUAL_BAR * size, BAR_SPREAD));
+                sd[6] = spread;
+                off[6] = (t.bar / mean).ln() / spread;
+            }
+        }
+        (sd, off)
+    }
+
+    /// The shape moved by natural parameters: centre, normal turned towards `frame_of`'s axes, radius (and its unevenness along and between
+    /// those axes), or core and bar radius.
+    pub(super) fn moved(&self, d: &[f64; SHAPE]) -> Option<Self> {
+        let f = frame_of(&self.normal());
+        let normal = (self.normal() + f.column(0) * d[3] + f.column(1) * d[4]).try_normalize(0.1)?;
+        let centre = self.centre() + Vector3::new(d[0], d[1], d[2]);
+        let plane = |s: Matrix2<f64>| -> Option<Rim> {
+            let g = turned_frame(&f, &normal)?;
+            rim_of(centre, normal, &g, &s)
+        };
+        Some(match self {
+            Self::Circle(r) => Self::Circle(plane(Matrix2::identity() * (r.a + d[5]))?),
+            Self::Ellipse(r, uneven) => {
+                let s = shape_matrix(r) + Matrix2::new(d[5] + d[6], d[7], d[7], d[5] - d[6]);
+                Self::Ellipse(plane(s)?, *uneven)
+            }
+            Self::Bar(t, known) => {
+                let torus = Torus { centre, normal, core: t.core + d[5], bar: t.bar * d[6].clamp(-1.0, 1.0).exp() };
+                if !(torus.bar > 0.0 && torus.bar < 0.95 * torus.core) {
+                    return None;
+                }
+                Self::Bar(torus, *known)
+            }
+        })
+    }
+
+    /// Natural parameters that lead from this shape to another of its kind, near it.
+    pub(super) fn difference(&self, to: &Self) -> [f64; SHAPE] {
+        let f = frame_of(&self.normal());
+        let (c, n) = (to.centre() - self.centre(), to.normal() - self.normal());
+        let mut d = [c.x, c.y, c.z, f.column(0).dot(&n), f.column(1).dot(&n), to.size() - self.size(), 0.0, 0.0];
+        match (self, to) {
+            (Self::Ellipse(a, _), Self::Ellipse(b, _)) => {
+                let s = shape_matrix(b) - shape_matrix(a);
+                (d[5], d[6], d[7]) = (0.5 * (s[(0, 0)] + s[(1, 1)]), 0.5 * (s[(0, 0)] - s[(1, 1)]), s[(0, 1)]);
+            }
+            (Self::Bar(a, _), Self::Bar(b, _)) => d[6] = (b.bar / a.bar).ln(),
+            _ => {}
+        }
+        d
+    }
+
+    /// Where points of a view lie about the shape's outline there. `None` where a camera or the shape's image is degenerate.
+    pub(super) fn places(&self, points: &[EdgePoint], p: &Projection) -> Option<Vec<Place>> {
+        match self {
+            Self::Circle(r) | Self::Ellipse(r, _) => {
+                let h = homography(p, r);
+                let conic = orient(&image_of_unit_circle(&(h / h.norm())));
+                let back = h.try_inverse()?;
+                let place = |q: &EdgePoint| {
+                    let y = back * q.uv.push(1.0);
+                    let on_circle = Vector2::new(y.x / y.z, y.y / y.z).try_normalize(0.0)?;
+                    let foot = r.centre + r.axis_a * (r.a * on_circle.x) + r.axis_b * (r.b * on_circle.y);
+                    let gradient = (conic * q.uv.push(1.0)).xy().try_normalize(0.0)?;
+                    Some(Place { residual: distance(&conic, &q.uv), gradient, foot })
+                };
+                points.iter().map(place).collect()
+            }
+            Self::Bar(t, _) => rays(points, p)?
+                .iter()
+                .map(|ray| t.touch(ray).map(|(residual, gradient, foot)| Place { residual, gradient, foot }))
+                .collect(),
+        }
+    }
+
+    /// Motion of a point of the outline by each parameter, in units of the parameter.
+    pub(super) fn moves(&self, foot: &Vector3<f64>) -> [Vector3<f64>; SHAPE] {
+        let f = frame_of(&self.normal());
+        let arm = foot - self.centre();
+        let (e1, e2, n) = (f.column(0).into_owned(), f.column(1).into_owned(), f.column(2).into_owned());
+        let mut out = [Vector3::zeros(); SHAPE];
+        out[0] = Vector3::x();
+        out[1] = Vector3::y();
+        out[2] = Vector3::z();
+        // A turn w moves the normal by w x n.
+        out[3] = n.cross(&e1).cross(&arm);
+        out[4] = n.cross(&e2).cross(&arm);
+        match self {
+            Self::Circle(r) | Self::Ellipse(r, _) => {
+                let y = Vector2::new(r.axis_a.dot(&arm) / r.a, r.axis_b.dot(&arm) / r.b);
+                let direction = r.axis_a * y.x + r.axis_b * y.y;
+                let (u, v) = (e1.dot(&direction), e2.dot(&direction));
+                out[5] = e1 * u + e2 * v;
+                if matches!(self, Self::Ellipse(..)) {
+                    out[6] = e1 * u - e2 * v;
+                    out[7] = e1 * v + e2 * u;
+                }
+            }
+            Self::Bar(t, _) => {
+                let along = arm - n * n.dot(&arm);
+                let e = along.try_normalize(0.0).unwrap_or(e1);
+                out[5] = e;
+                out[6] = arm - e * t.core;
+            }
+        }
+        out
+    }
+}
+
+/// Where an edge point lies about a shape's outline.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Place {
+    /// Distance from the outline, pixels, positive outside.
+    pub(super) residual: f64,
+    /// Direction in the image in which the distance grows.
+    pub(super) gradient: Vector2<f64>,
+    /// The shape's point that the outline shows there.
+    pub(super) foot: Vector3<f64>,
+}
+
+impl Place {
+    /// Change of the residual while the shown point moves: the outline moves under the edge point.
+    pub(super) fn by_motion(&self, motion: &Vector3<f64>, p: &Projection) -> f64 {
+        -self.seen(&(p.fixed_view::<3, 3>(0, 0) * motion), p)
+    }
+
+    /// Change of the residual while the camera's projection changes.
+    pub(super) fn by_camera(&self, change: &Projection, p: &Projection) -> f64 {
+        -self.seen(&(change * self.foot.push(1.0)), p)
+    }
+
+    /// A change of the shown point's homogeneous image along the gradient, pixels.
+    fn seen(&self, d: &Vector3<f64>, p: &Projection) -> f64 {
+        let h = p * self.foot.push(1.0);
+        self.gradient.dot(&(d.xy() - h.xy() * (d.z / h.z))) / h.z
+    }
+}
+
+/// The frame of a plane carried along when its normal turns.
+fn turned_frame(f: &Matrix3<f64>, normal: &Vector3<f64>) -> Option<[Vector3<f64>; 2]> {
+    let e1 = f.column(0).into_owned();
+    let e1 = (e1 - normal * normal.dot(&e1)).try_normalize(1e-6)?;
+    Some([e1, normal.cross(&e1)])
+}
+
+/// Symmetric matrix of a rim's semi-axes in the axes of `frame_of` its normal.
+fn shape_matrix(r: &Rim) -> Matrix2<f64> {
+    let f = frame_of(&r.normal);
+    let a = Vector2::new(r.axis_a.dot(&f.column(0)), r.axis_a.dot(&f.column(1)));
+    let b = Vector2::new(-a.y, a.x);
+    (a * a.transpose() * r.a + b * b.transpose() * r.b) / a.norm_squared().max(1e-12)
+}
+
+fn rim_of(centre: Vector3<f64>, normal: Vector3<f64>, g: &[Vector3<f64>; 2], s: &Matrix2<f64>) -> Option<Rim> {
+    let eigen = s.symmetric_eigen();
+    let (big, small) = if eigen.eigenvalues[0] >= eigen.eigenvalues[1] { (0, 1) } else { (1, 0) };
+    let v = eigen.eigenvectors.column(big);
+    let axis_a = signed_axis(g[0] * v[0] + g[1] * v[1]);
+    let (a, b) = (eigen.eigenvalues[big], eigen.eigenvalues[small]);
+    (b > 0.0 && a.is_finite()).then(|| Rim { centre, normal, a, b, axis_a, axis_b: normal.cross(&axis_a) })
+}
+
+/// Maps the unit circle to a rim's image.
+fn homography(p: &Projection, r: &Rim) -> Matrix3<f64> {
+    let m = p.fixed_view::<3, 3>(0, 0);
+    Matrix3::from_columns(&[m * r.axis_a * r.a, m * r.axis_b * r.b, m * r.centre + p.column(3)])
+}
