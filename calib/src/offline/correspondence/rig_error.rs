@@ -138,9 +138,9 @@ impl RigError {
         Self::posterior(rig, prior, &found, Seen::default())
     }
 
-    /// The rig file believed to the letter, whatever the matches say.
-    pub fn as_given(&self) -> Self {
-        let put_right = |k: usize| self.p[k] + self.modes.iter().zip(&self.given).map(|(m, v)| m[k] * *v).sum::<Projection>();
+    /// A rig with so many standard deviations of each mode put right and nothing left unknown.
+    pub fn held(&self, modes: &[f64]) -> Self {
+        let put_right = |k: usize| self.p[k] + self.modes.iter().zip(modes).map(|(m, v)| m[k] * *v).sum::<Projection>();
         Self { p: [put_right(0), put_right(1)], modes: Vec::new(), parts: Vec::new(), ..self.clone() }
     }
 

@@ -98,30 +98,47 @@ fn explains(stretches: &[Stretch], used: &[bool]) -> bool {
 pub(in crate::offline) fn fit(hypothesis: &Hypothesis, stretches: &[Stretch], rig: &RigError) -> Option<Fitted> {
     let free = fit_rig(hypothesis, stretches, rig)?;
     if rig.modes.is_empty() {
-        return Some(free);
+        return Some(free.about(free.fitted.clone(), free.fitted.phi.clone()));
     }
-    let start = Hypothesis { shapes: free.shapes.clone(), ..hypothesis.clone() };
-    let Some(given) = fit_rig(&start, stretches, &rig.as_given()) else { return Some(free) };
+    let start = Hypothesis { shapes: free.fitted.shapes.clone(), ..hypothesis.clone() };
+    let held = |phi: &[f64]| fit_rig(&start, stretches, &rig.held(phi)).map(|f| f.fitted);
+    // Smooth errors of the edges look like errors of the rig, so that the rig is estimated with the waves.
+    let seen = &free.fitted.phi + free.step.rows(free.fitted.parameters, rig.modes.len());
+    let (Some(put_right), Some(given)) = (held(seen.as_slice()), held(rig.given())) else {
+        return Some(free.about(free.fitted.clone(), free.fitted.phi.clone()));
+    };
     // Weights of both, whose sum is one.
     let odds = rig.log_odds_given();
     let by_odds = |log: f64| -(1.0 + log.exp()).ln();
-    let (a, b) = (free.log_evidence + by_odds(odds), given.log_evidence + by_odds(-odds));
+    let (a, b) = (free.fitted.log_evidence + by_odds(odds), given.log_evidence + by_odds(-odds));
     let log_evidence = a.max(b) + (1.0 + (-(a - b).abs()).exp()).ln();
-    if a >= b {
-        return Some(Fitted { log_evidence, ..free });
-    }
-    let by_shape = free.shapes.first()?.difference(given.shapes.first()?);
-    let by_rig = rig.given().iter().zip(free.phi.iter()).map(|(g, f)| g - f);
-    let apart = DVector::from_iterator(free.cov.nrows(), by_shape.into_iter().take(free.parameters).chain(by_rig));
-    Some(Fitted {
-        cov: free.cov + &apart * apart.transpose(),
-        phi: DVector::from_column_slice(rig.given()),
-        log_evidence,
-        ..given
-    })
+    let (estimate, phi) =
+        if a >= b { (put_right, seen) } else { (given, DVector::from_column_slice(rig.given())) };
+    Some(Fitted { log_evidence, ..free.about(estimate, phi) })
 }
 
-fn fit_rig(hypothesis: &Hypothesis, stretches: &[Stretch], rig: &RigError) -> Option<Fitted> {
+/// A fit with everything unknown: its covariance about the solution with waves, which is a step away from the least squares of the shapes.
+struct Free {
+    fitted: Fitted,
+    step: DVector<f64>,
+}
+
+impl Free {
+    /// Another estimate with this fit's covariance, taken about it.
+    fn about(&self, estimate: Fitted, phi: DVector<f64>) -> Fitted {
+        let free = &self.fitted;
+        let by_shape = match (free.shapes.first(), estimate.shapes.first()) {
+            (Some(from), Some(to)) => from.difference(to),
+            _ => return estimate,
+        };
+        let by_rig = phi.iter().zip(free.phi.iter()).map(|(to, from)| to - from);
+        let apart = DVector::from_iterator(free.cov.nrows(), by_shape.into_iter().take(free.parameters).chain(by_rig));
+        let off = apart - &self.step;
+        Fitted { cov: &free.cov + &off * off.transpose(), phi, ..estimate }
+    }
+}
+
+fn fit_rig(hypothesis: &Hypothesis, stretches: &[Stretch], rig: &RigError) -> Option<Free> {
     let mut shapes = hypothesis.shapes.clone();
     let mut phi = DVector::<f64>::zeros(rig.modes.len());
     let mut kappa = 1.0;
@@ -156,14 +173,14 @@ fn result(
     solved: &Solved,
     sums: &Sums,
     used: &[bool],
-) -> Fitted {
+) -> Free {
     let parameters = shapes.first().map_or(0, Shape::parameters);
     let pick: Vec<usize> = (0..parameters).chain(linear.rig..linear.rig + phi.len()).collect();
     let cov = DMatrix::from_fn(pick.len(), pick.len(), |i, j| {
-        let about = solved.inverse[(pick[i], pick[j])] + solved.step[pick[i]] * solved.step[pick[j]];
-        about * linear.unit[pick[i]] * linear.unit[pick[j]]
+        solved.inverse[(pick[i], pick[j])] * linear.unit[pick[i]] * linear.unit[pick[j]]
     });
-    Fitted {
+    let step = DVector::from_fn(pick.len(), |i, _| solved.step[pick[i]] * linear.unit[pick[i]]);
+    let fitted = Fitted {
         shapes,
         log_evidence: solved.log_evidence,
         chi2: solved.chi2,
@@ -174,7 +191,8 @@ fn result(
         cov,
         parameters,
         residuals: linear.places.iter().map(|p| p.residual).zip(used.iter().copied()).collect(),
-    }
+    };
+    Free { fitted, step }
 }
 
 /// A view's projection with the expected error of the modes put right.
