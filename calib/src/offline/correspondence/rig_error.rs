@@ -184,12 +184,7 @@ impl RigError {
         self.modes.iter().map(|m| by_mode(m).powi(2)).sum::<f64>().sqrt()
     }
 
-    fn posterior(
-        rig: &Rig,
-        prior: &RigPrior,
-        found: &Mixture,
-        seen: Seen,
-    ) -> Self {
+    fn posterior(rig: &Rig, prior: &RigPrior, found: &Mixture, seen: Seen) -> Self {
         let corrected = prior.corrected(rig, &found.mean);
         let p = View::BOTH.map(|v| projection(&corrected, v));
         let by_phi = derivatives(&corrected, prior);

@@ -37,15 +37,14 @@ impl Linear {
     pub(super) fn new(
         hypothesis: &Hypothesis,
         shapes: &[Shape],
-        phi: &DVector<f64>,
+        (phi, displaced): (&DVector<f64>, &[f64]),
         stretches: &[Stretch],
         rig: &RigError,
     ) -> Option<Self> {
         let count: usize = stretches.iter().map(|s| s.points.len()).sum();
         let by_shape: usize = shapes.iter().map(Shape::parameters).sum();
-        let apart = if hypothesis.unrelated_px.is_some() { 2 * shapes.len() } else { 0 };
         let (first_rig, first_apart) = (by_shape, by_shape + rig.modes.len());
-        let width = first_apart + apart;
+        let width = first_apart + hypothesis.displacements();
         let mut out = Self {
             columns: DMatrix::zeros(count, width),
             places: Vec::with_capacity(count),
@@ -55,7 +54,7 @@ impl Linear {
             coaxial: [0.0; 5],
             rig: first_rig,
         };
-        out.offset.iter_mut().skip(first_rig).zip(phi.iter()).for_each(|(o, p)| *o = *p);
+        out.offset.iter_mut().skip(first_rig).zip(phi.iter().chain(displaced)).for_each(|(o, p)| *o = *p);
         let p = [0, 1].map(|k| corrected(rig, phi, k));
         for s in stretches {
             let shape = shapes.get(s.shape)?;
@@ -75,7 +74,15 @@ impl Linear {
         finite.then_some(out)
     }
 
-    fn by_shape_and_rig(&mut self, shape: &Shape, view: usize, p: &Projection, rig: &RigError, at: usize, first: usize) {
+    fn by_shape_and_rig(
+        &mut self,
+        shape: &Shape,
+        view: usize,
+        p: &Projection,
+        rig: &RigError,
+        at: usize,
+        first: usize,
+    ) {
         let (sd, off) = shape.prior();
         for k in 0..shape.parameters() {
             self.unit[at + k] = sd[k];
@@ -145,8 +152,10 @@ impl Linear {
         let spread = (spread / s.points.len().max(1) as f64).sqrt().max(1e-9);
         for (i, q) in s.points.iter().enumerate() {
             let by = self.places.get(first + i)?.gradient.dot(&across) * px;
+            let taller = by * across.dot(&(q.uv - middle)) / spread;
             self.columns[(first + i, at)] = by;
-            self.columns[(first + i, at + 1)] = by * across.dot(&(q.uv - middle)) / spread;
+            self.columns[(first + i, at + 1)] = taller;
+            self.places.get_mut(first + i)?.residual += by * self.offset[at] + taller * self.offset[at + 1];
         }
         Some(())
     }

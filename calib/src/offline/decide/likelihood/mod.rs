@@ -78,6 +78,13 @@ pub(in crate::offline) struct Hypothesis {
     pub(in crate::offline) unrelated_px: Option<f64>,
 }
 
+impl Hypothesis {
+    /// Number of parameters by which unrelated contours are displaced.
+    fn displacements(&self) -> usize {
+        if self.unrelated_px.is_some() { 2 * self.shapes.len() } else { 0 }
+    }
+}
+
 /// Part of each contour that a model has to explain: the rest is hidden or somebody else's.
 const EXPLAINED: f64 = 0.5;
 
@@ -112,8 +119,7 @@ pub(in crate::offline) fn fit(hypothesis: &Hypothesis, stretches: &[Stretch], ri
     let by_odds = |log: f64| -(1.0 + log.exp()).ln();
     let (a, b) = (free.fitted.log_evidence + by_odds(odds), given.log_evidence + by_odds(-odds));
     let log_evidence = a.max(b) + (1.0 + (-(a - b).abs()).exp()).ln();
-    let (estimate, phi) =
-        if a >= b { (put_right, seen) } else { (given, DVector::from_column_slice(rig.given())) };
+    let (estimate, phi) = if a >= b { (put_right, seen) } else { (given, DVector::from_column_slice(rig.given())) };
     Some(Fitted { log_evidence, ..free.about(estimate, phi) })
 }
 
@@ -141,9 +147,10 @@ impl Free {
 fn fit_rig(hypothesis: &Hypothesis, stretches: &[Stretch], rig: &RigError) -> Option<Free> {
     let mut shapes = hypothesis.shapes.clone();
     let mut phi = DVector::<f64>::zeros(rig.modes.len());
+    let mut displaced = vec![0.0; hypothesis.displacements()];
     let mut kappa = 1.0;
     for round in 0..ROUNDS {
-        let linear = Linear::new(hypothesis, &shapes, &phi, stretches, rig)?;
+        let linear = Linear::new(hypothesis, &shapes, (&phi, &displaced), stretches, rig)?;
         let used = linear.used(kappa, round);
         let sums = Sums::new(&linear, &used);
         // The estimate is least squares without the waves; what they would move it by goes into its covariance. On real edges, which have
@@ -162,18 +169,14 @@ fn fit_rig(hypothesis: &Hypothesis, stretches: &[Stretch], rig: &RigError) -> Op
         for (k, v) in phi.iter_mut().enumerate() {
             *v += solved.step[linear.rig + k];
         }
+        for (k, v) in displaced.iter_mut().enumerate() {
+            *v += solved.step[linear.rig + phi.len() + k];
+        }
     }
     None
 }
 
-fn result(
-    linear: &Linear,
-    shapes: Vec<Shape>,
-    phi: DVector<f64>,
-    solved: &Solved,
-    sums: &Sums,
-    used: &[bool],
-) -> Free {
+fn result(linear: &Linear, shapes: Vec<Shape>, phi: DVector<f64>, solved: &Solved, sums: &Sums, used: &[bool]) -> Free {
     let parameters = shapes.first().map_or(0, Shape::parameters);
     let pick: Vec<usize> = (0..parameters).chain(linear.rig..linear.rig + phi.len()).collect();
     let cov = DMatrix::from_fn(pick.len(), pick.len(), |i, j| {

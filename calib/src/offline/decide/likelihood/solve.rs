@@ -107,14 +107,13 @@ impl Sums {
 impl Waves {
     fn new<'a>(linear: &Linear, s: &Stretch, rows: impl Iterator<Item = (usize, &'a f64)>) -> Self {
         let width = linear.columns.ncols();
-        let rows: Vec<(usize, SVector<f64, COLUMNS>)> = rows.map(|(i, t)| (i, waves_at(*t) / linear.sigma[i])).collect();
-        let mut out = Self {
-            normal: SMatrix::zeros(),
-            cross: DMatrix::zeros(COLUMNS, width),
-            gradient: SVector::zeros(),
-        };
+        let rows: Vec<(usize, SVector<f64, COLUMNS>)> =
+            rows.map(|(i, t)| (i, waves_at(*t) / linear.sigma[i])).collect();
+        let mut out =
+            Self { normal: SMatrix::zeros(), cross: DMatrix::zeros(COLUMNS, width), gradient: SVector::zeros() };
         debug_assert!(rows.len() <= s.points.len());
-        let scaled = DMatrix::from_fn(rows.len(), width, |n, k| linear.columns[(rows[n].0, k)] / linear.sigma[rows[n].0]);
+        let scaled =
+            DMatrix::from_fn(rows.len(), width, |n, k| linear.columns[(rows[n].0, k)] / linear.sigma[rows[n].0]);
         let own = DMatrix::from_fn(rows.len(), COLUMNS, |n, k| rows[n].1[k]);
         out.cross = own.tr_mul(&scaled);
         for (i, w) in &rows {
