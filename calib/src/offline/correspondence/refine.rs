@@ -1,4 +1,5 @@
-//! A match to a fraction of a pixel: the patch of one image is shifted over the other until their grey values agree best.
+//! A match to a fraction of a pixel: the patch of one image is shifted over the other until their grey values agree
+//! best.
 
 use crate::offline::edges::picture::Picture;
 use graspd_rt::geom::Pixel;
@@ -32,7 +33,8 @@ impl Found {
     }
 }
 
-/// Refines a match of the place `from` of the first image with `start` in the second, over shift, contrast and brightness.
+/// Refines a match of the place `from` of the first image with `start` in the second, over shift, contrast and
+/// brightness.
 ///
 /// `None` where the patches do not agree or do not determine the shift.
 pub(super) fn refine(images: [&Picture; 2], from: Pixel, start: Pixel, noise: f64) -> Option<Found> {

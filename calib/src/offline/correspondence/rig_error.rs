@@ -1,13 +1,15 @@
 //! The rig's own error: its prior, what the two images of a pair say about it, and what stays unknown.
 //!
-//! A rig file is never exact. Its error is a vector `phi` of twelve numbers with a Gaussian prior: rotation and place of the right camera,
-//! focal lengths (common and difference), principal points. In units of the prior's standard deviations the prior is `N(0, I)`, and
-//! `P(phi) = P + sum_j phi_j dP_j` to first order: an error of a few tenths of a degree leaves a second-order rest below 0.02 px.
+//! A rig file is never exact. Its error is a vector `phi` of twelve numbers with a Gaussian prior: rotation and place
+//! of the right camera, focal lengths (common and difference), principal points. In units of the prior's standard
+//! deviations the prior is `N(0, I)`, and `P(phi) = P + sum_j phi_j dP_j` to first order: an error of a few tenths of
+//! a degree leaves a second-order rest below 0.02 px.
 //!
-//! One pair of images determines the part of `phi` that moves matching points off each other's epipolar lines. [`RigError::observe`]
-//! estimates it once for the pair from all matches, so that no contour has to be judged by a rig that every other point contradicts. What the
-//! matches leave open (above all the vergence, which looks like another depth) stays in [`RigError::modes`] and goes into every fit and
-//! covariance as an unknown of its own. Derived in `docs/PAPER.md`, "The rig's error".
+//! One pair of images determines the part of `phi` that moves matching points off each other's epipolar lines.
+//! [`RigError::observe`] estimates it once for the pair from all matches, so that no contour has to be judged by a
+//! rig that every other point contradicts. What the matches leave open (above all the vergence, which looks like
+//! another depth) stays in [`RigError::modes`] and goes into every fit and covariance as an unknown of its own.
+//! Derived in `docs/PAPER.md`, "The rig's error".
 
 use crate::offline::edges::lens::projection;
 use crate::offline::rim::cone::camera_centre;
@@ -18,19 +20,21 @@ use nalgebra::{Matrix3, SMatrix, SVector, UnitQuaternion, Vector2, Vector3};
 /// Number of parameters of a rig's error.
 pub const PARAMETERS: usize = 12;
 
-/// A rig's error in units of its prior's standard deviations: rotation (3), place of the right camera (3), focal length common and
-/// difference, principal point left (2) and right (2).
+/// A rig's error in units of its prior's standard deviations: rotation (3), place of the right camera (3), focal
+/// length common and difference, principal point left (2) and right (2).
 pub type Phi = SVector<f64, PARAMETERS>;
 
-/// Standard deviations of what a rig file may have wrong: the rig's stated quality, or the default of [`graspd_rt::geom::RigError`].
+/// Standard deviations of what a rig file may have wrong: the rig's stated quality, or the default of
+/// [`graspd_rt::geom::RigError`].
 ///
-/// The right camera may also stand elsewhere, along each axis by as large a part of the baseline as its rotation is off in radians: the
-/// baseline's direction is known no better than the cameras' own.
+/// The right camera may also stand elsewhere, along each axis by as large a part of the baseline as its rotation is
+/// off in radians: the baseline's direction is known no better than the cameras' own.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RigPrior(pub graspd_rt::geom::RigError);
 
 impl RigPrior {
-    /// The same shape of error, scaled so that it displaces epipolar lines by `px` pixels (one standard deviation). Zero trusts the rig file.
+    /// The same shape of error, scaled so that it displaces epipolar lines by `px` pixels (one standard deviation).
+    /// Zero trusts the rig file.
     pub fn displacing(self, rig: &Rig, px: f64) -> Self {
         let own = RigError::prior(rig, &self).unknown_px();
         Self(self.0.scaled(if own > 0.0 { px / own } else { 0.0 }))
@@ -81,7 +85,8 @@ pub struct RigError {
     /// The same parts as errors of the rig.
     parts: Vec<Phi>,
     prior: RigPrior,
-    /// The rig file as it was given, in units of the modes, and the logarithm of the odds that it is right as it stands against the rest.
+    /// The rig file as it was given, in units of the modes, and the logarithm of the odds that it is right as it
+    /// stands against the rest.
     given: Vec<f64>,
     /// See [`RigError::log_odds_given`].
     log_odds: f64,
@@ -106,15 +111,20 @@ pub struct Seen {
 
 /// Distance at which a rig works, in baselines.
 const TYPICAL_DISTANCE: f64 = 3.0;
-/// Fewest agreeing matches that say anything: as many as the six observable parts of the error, and as many again to confirm them.
+/// Fewest agreeing matches that say anything: as many as the six observable parts of the error, and as many again to
+/// confirm them.
 const LEAST_AGREEING: usize = 12;
-/// Qualities of a rig that are weighed, as scales of the prior: from one as good as a pixel allows to one as bad as stated.
+/// Qualities of a rig that are weighed, as scales of the prior: from one as good as a pixel allows to one as bad as
+/// stated.
 const QUALITIES: [f64; 6] = [0.03, 0.06, 0.12, 0.25, 0.5, 1.0];
-/// Widths of the redescending loss, pixels, from one that holds every rig of the prior to one of a few standard deviations of a match.
+/// Widths of the redescending loss, pixels, from one that holds every rig of the prior to one of a few standard
+/// deviations of a match.
 const WIDTHS: [f64; 6] = [8.0, 4.0, 2.0, 1.2, 0.8, 0.6];
-/// Scatters of right matches across their lines that are weighed, pixels: patches of a clean image, of a blurred or compressed one.
+/// Scatters of right matches across their lines that are weighed, pixels: patches of a clean image, of a blurred or
+/// compressed one.
 const SCATTERS_PX: [f64; 3] = [0.1, 0.2, 0.4];
-/// Weight of a match: spots come in groups that see one edge or one occlusion and are off together, so that two count as one.
+/// Weight of a match: spots come in groups that see one edge or one occlusion and are off together, so that two count
+/// as one.
 const WEIGHT: f64 = 0.5;
 /// Part of the matches that is false beforehand.
 const FALSE: f64 = 0.5;
@@ -149,8 +159,8 @@ impl RigError {
         &self.given
     }
 
-    /// Logarithm of the odds by the matches that the rig file is right as it stands, against an error of the prior's size or less; as likely
-    /// as the other beforehand.
+    /// Logarithm of the odds by the matches that the rig file is right as it stands, against an error of the prior's
+    /// size or less; as likely as the other beforehand.
     pub fn log_odds_given(&self) -> f64 {
         self.log_odds
     }
@@ -172,8 +182,8 @@ impl RigError {
         Self { p: swap(&self.p), modes: self.modes.iter().map(swap).collect(), ..self.clone() }
     }
 
-    /// Epipolar displacement by what is unknown of the rig, one standard deviation, pixels: in the middle of the left image, for a point at
-    /// [`TYPICAL_DISTANCE`] baselines.
+    /// Epipolar displacement by what is unknown of the rig, one standard deviation, pixels: in the middle of the left
+    /// image, for a point at [`TYPICAL_DISTANCE`] baselines.
     pub fn unknown_px(&self) -> f64 {
         let at = Vector3::new(0.0, 0.0, TYPICAL_DISTANCE * self.rig.centre(View::Right).norm());
         let place = |p: &Projection| crate::offline::rim::cone::project(p, &at);
@@ -200,8 +210,8 @@ impl RigError {
         Self { rig: corrected, p, modes, parts, prior: *prior, given, log_odds: found.log_odds, seen }
     }
 
-    /// What the prior and the matches of a pair of images say together: maximum a posteriori under a redescending loss that starts wide
-    /// enough for every rig of the prior.
+    /// What the prior and the matches of a pair of images say together: maximum a posteriori under a redescending
+    /// loss that starts wide enough for every rig of the prior.
     pub fn observe(rig: &Rig, prior: &RigPrior, matches: &[Match]) -> Self {
         let mut seen = Seen { matches: matches.len(), ..Seen::default() };
         let model = Epipolar::new(rig, prior, matches);
@@ -250,8 +260,9 @@ impl RigError {
 impl Seen {
     /// Whether so many matches agree that chance is out of the question.
     ///
-    /// A false match lies anywhere within [`SPREAD_PX`], so that it agrees with probability `p0`; the six observable parts of the error
-    /// are free to please six of them. Four standard deviations of the binomial beyond that are asked for.
+    /// A false match lies anywhere within [`SPREAD_PX`], so that it agrees with probability `p0`; the six observable
+    /// parts of the error are free to please six of them. Four standard deviations of the binomial beyond that are
+    /// asked for.
     fn is_significant(&self, gate_px: f64) -> bool {
         let n = self.matches as f64;
         let p0 = 2.0 * gate_px / SPREAD_PX;
@@ -308,10 +319,10 @@ impl<'a> Epipolar<'a> {
 
     /// Mean and covariance of the error when the quality of the rig is itself unknown.
     ///
-    /// The prior says how bad a rig may be; how good this one is, its visible part says: one calibration made all of it, so that a rig whose
-    /// epipolar lines fit ten times better than the prior expects is ten times better in what cannot be seen. With the quality `q` as the
-    /// scale of the prior, the evidence of the matches follows by Laplace's method; the answer is the mixture over
-    /// [`QUALITIES`], each as likely as the other beforehand.
+    /// The prior says how bad a rig may be; how good this one is, its visible part says: one calibration made all of
+    /// it, so that a rig whose epipolar lines fit ten times better than the prior expects is ten times better in what
+    /// cannot be seen. With the quality `q` as the scale of the prior, the evidence of the matches follows by
+    /// Laplace's method; the answer is the mixture over [`QUALITIES`], each as likely as the other beforehand.
     fn by_quality(&self, start: &Phi) -> Option<Mixture> {
         let (r, j) = (self.residuals(start), self.slopes(start));
         // Linear in the error from here on.
@@ -366,7 +377,8 @@ impl<'a> Epipolar<'a> {
     }
 }
 
-/// Mean and covariance of the error, the scatter of right matches, pixels, and the logarithm of the odds of no error at all.
+/// Mean and covariance of the error, the scatter of right matches, pixels, and the logarithm of the odds of no error
+/// at all.
 struct Mixture {
     mean: Phi,
     cov: SMatrix<f64, PARAMETERS, PARAMETERS>,
@@ -374,14 +386,16 @@ struct Mixture {
     log_odds: f64,
 }
 
-/// A match in the linear model: distance from its line at zero error, the distance's slope, and what the match itself is off by.
+/// A match in the linear model: distance from its line at zero error, the distance's slope, and what the match itself
+/// is off by.
 struct Row {
     residual: f64,
     slope: Phi,
     sigma: f64,
 }
 
-/// Probability densities of a match that is right, and of one that is false, where it lies `t` standard deviations `s` from its line.
+/// Probability densities of a match that is right, and of one that is false, where it lies `t` standard deviations
+/// `s` from its line.
 fn densities(t: f64, s: f64) -> (f64, f64) {
     let root = (2.0 * std::f64::consts::PI).sqrt();
     ((1.0 - FALSE) / (s * root) * (-0.5 * t * t).exp(), FALSE / SPREAD_PX)
@@ -397,8 +411,8 @@ fn right_or_false(rows: &[Row], at: &Phi, scatter: f64) -> f64 {
     WEIGHT * each.sum::<f64>()
 }
 
-/// Maximum a posteriori for one scatter and one quality, with its log evidence: a match is right, and scatters so much, or it is false and lies
-/// anywhere within [`SPREAD_PX`].
+/// Maximum a posteriori for one scatter and one quality, with its log evidence: a match is right, and scatters so
+/// much, or it is false and lies anywhere within [`SPREAD_PX`].
 fn robust(rows: &[Row], start: &Phi, scatter: f64, q: f64) -> Option<(f64, Phi, SMatrix<f64, PARAMETERS, PARAMETERS>)> {
     let identity = SMatrix::<f64, PARAMETERS, PARAMETERS>::identity();
     let mut at = *start;

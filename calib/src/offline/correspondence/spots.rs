@@ -1,8 +1,9 @@
 //! Whether two pictures were given in the wrong order, from everything that is in them.
 //!
-//! A rim near the middle of a symmetrical rig can be reconstructed from its two contours either way round: the contours alone cannot tell. The rest of
-//! the pictures can. Distinct spots of one picture are looked for in the other along the lines, and in front of both cameras, where the rig says that they
-//! have to be; in the right order they are found, in the wrong one their lines run elsewhere, or their places lie behind the cameras.
+//! A rim near the middle of a symmetrical rig can be reconstructed from its two contours either way round: the
+//! contours alone cannot tell. The rest of the pictures can. Distinct spots of one picture are looked for in the
+//! other along the lines, and in front of both cameras, where the rig says that they have to be; in the right order
+//! they are found, in the wrong one their lines run elsewhere, or their places lie behind the cameras.
 
 use crate::offline::correspondence::refine;
 use crate::offline::correspondence::rig_error::Match;
@@ -51,10 +52,12 @@ impl Votes {
 
 /// Side of a patch.
 const SIDE: usize = 2 * HALF as usize + 1;
-/// Columns of a patch that are worked on: the rest of the wanted patch's rows is zero, so that what lies beside the other one does not count.
+/// Columns of a patch that are worked on: the rest of the wanted patch's rows is zero, so that what lies beside the
+/// other one does not count.
 const LANES: usize = 16;
 
-/// A picture at half its size: quick to search, and blind to the noise. Its values are sums of four grey values, so that all sums are exact.
+/// A picture at half its size: quick to search, and blind to the noise. Its values are sums of four grey values, so
+/// that all sums are exact.
 struct Small {
     w: usize,
     h: usize,
@@ -116,7 +119,8 @@ impl Small {
         Some((joint / (wanted.size * size)) as f32)
     }
 
-    /// Products of the gradient (`xx`, `xy`, `yy`) over the column of each pixel of a row: every other of nine rows. Nothing at the border.
+    /// Products of the gradient (`xx`, `xy`, `yy`) over the column of each pixel of a row: every other of nine rows.
+    /// Nothing at the border.
     fn columns(&self, y: usize, out: &mut [Vec<f32>; 3]) {
         let [xx, xy, yy] = out;
         for o in [&mut *xx, &mut *xy, &mut *yy] {
@@ -228,7 +232,8 @@ impl Totals {
     }
 }
 
-/// What the spots of two images say: their votes on the order, and where those that were found in the order as given lie.
+/// What the spots of two images say: their votes on the order, and where those that were found in the order as given
+/// lie.
 #[derive(Clone, Debug, Default)]
 pub struct Spots {
     /// Votes on the order of the images.
@@ -342,7 +347,8 @@ impl<'a> Ray<'a> {
         let d = self.back * Vector3::new(i.x, i.y, 1.0);
         let Some(d) = d.try_normalize(0.0) else { return Vec::new() };
         let at = |inverse: f64| -> Option<Pixel> {
-            // A point at 1 / inverse along the ray, in homogeneous coordinates so that infinity is a place like any other.
+            // A point at 1 / inverse along the ray, in homogeneous coordinates so that infinity is a place like any
+            // other.
             let h = self.to * (self.eye * inverse + d).push(inverse);
             (h.z > 0.0).then(|| Pixel::new(h.x / h.z, h.y / h.z))
         };

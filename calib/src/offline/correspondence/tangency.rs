@@ -1,13 +1,15 @@
 //! Whether two contours are pictures of one rim (section 4.2, errata B3).
 //!
-//! Two image ellipses have 10 parameters and a conic in space 8, so a match obeys two conditions; the paper's polynomial is one of them.
-//! Both are seen in the picture: each epipolar line tangent to the left ellipse must be tangent to the right one.
+//! Two image ellipses have 10 parameters and a conic in space 8, so a match obeys two conditions; the paper's
+//! polynomial is one of them. Both are seen in the picture: each epipolar line tangent to the left ellipse must be
+//! tangent to the right one.
 
 use crate::offline::conic::{EllipseFit, ellipse_of};
 use crate::offline::rim::model::Projection;
 use nalgebra::{Matrix3, Vector2, Vector3, Vector4};
 
-/// The two epipolar tangency gaps in the right picture, pixels, signed; NaN where the epipole lies inside the left ellipse.
+/// The two epipolar tangency gaps in the right picture, pixels, signed; NaN where the epipole lies inside the left
+/// ellipse.
 ///
 /// `o_left` is the left projection centre (last coordinate 1), in the frame of both matrices.
 pub fn epipolar_gaps(
@@ -51,7 +53,8 @@ pub fn epipolar_gaps(
     })
 }
 
-/// The gaps of two fits with their standard deviations, propagated from both covariances (at the given noise, in units of the fits' sigma).
+/// The gaps of two fits with their standard deviations, propagated from both covariances (at the given noise, in
+/// units of the fits' sigma).
 pub fn gaps_with_sigma(
     fits: [&EllipseFit; 2],
     p: [&Projection; 2],
@@ -86,10 +89,11 @@ pub fn gaps_with_sigma(
 
 /// Upper limit of the two-view excess at a gate of so many standard deviations.
 ///
-/// With the noise known the excess is chi-squared with 2 degrees of freedom; with the noise estimated from `dof` residuals it is twice
-/// an F(2, dof) variable, whose tail is elementary: `P(x > t) = (1 + t / dof)^(-dof / 2)`.
+/// With the noise known the excess is chi-squared with 2 degrees of freedom; with the noise estimated from `dof`
+/// residuals it is twice an F(2, dof) variable, whose tail is elementary: `P(x > t) = (1 + t / dof)^(-dof / 2)`.
 pub fn excess_limit(gate_sigmas: f64, dof: Option<usize>) -> f64 {
-    // Two-sided tail of the normal distribution, by the asymptotic series' leading bound; exact enough for a gate (within 6 % at 4 sigma).
+    // Two-sided tail of the normal distribution, by the asymptotic series' leading bound; exact enough for a gate
+    // (within 6 % at 4 sigma).
     let z = gate_sigmas.max(1.0);
     let tail = 2.0 * (-0.5 * z * z).exp() / (z * (2.0 * std::f64::consts::PI).sqrt())
         * (1.0 - 1.0 / (z * z) + 3.0 / z.powi(4));

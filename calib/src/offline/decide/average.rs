@@ -1,8 +1,9 @@
 //! A circle that might be an ellipse after all.
 //!
-//! That a rim is a circle is assumed where its edges do not speak against it, and a circle's normal is several times as certain as an ellipse's. A rim that is
-//! an ellipse by a hundredth, or a rig that makes one of it, is then wrong by more than the circle's covariance admits. So the answer stays the circle, and its
-//! covariance becomes that of both models together, each by its probability.
+//! That a rim is a circle is assumed where its edges do not speak against it, and a circle's normal is several times
+//! as certain as an ellipse's. A rim that is an ellipse by a hundredth, or a rig that makes one of it, is then wrong
+//! by more than the circle's covariance admits. So the answer stays the circle, and its covariance becomes that of
+//! both models together, each by its probability.
 
 use crate::offline::rim::circle::frame_of;
 use crate::offline::rim::model::Reconstruction;

@@ -35,9 +35,11 @@ pub(in crate::offline) struct Weighed {
     pub(in crate::offline) log: f64,
 }
 
-/// Prior probabilities. They matter little: a model that is right beats the others by tens of units of the logarithm, and what does not is asked about.
+/// Prior probabilities. They matter little: a model that is right beats the others by tens of units of the logarithm,
+/// and what does not is asked about.
 ///
-/// A hand chooses the same contour in both images, and the contours offered to it include its neighbours; rims are circles more often than ellipses.
+/// A hand chooses the same contour in both images, and the contours offered to it include its neighbours; rims are
+/// circles more often than ellipses.
 const UNRELATED: f64 = 0.2;
 const OPPOSITE: f64 = 0.01;
 const ELLIPSE: f64 = 0.15;

@@ -1,9 +1,10 @@
 //! Which contours of the two views are pictures of one rim, and of what kind of rim.
 //!
-//! Each view's selection gives a few contours, likeliest first. Every pair is weighed by the likelihood: circle, ellipse, two contours that have
-//! nothing to do with each other. For the likeliest pair a round bar with the clicked outline is looked for, and weighed on all four outlines
-//! against a flat ring. A model is accepted when everything that would lead to another grasp is out of the question ([`MOST_WRONG`]);
-//! otherwise the refusal names what could not be excluded.
+//! Each view's selection gives a few contours, likeliest first. Every pair is weighed by the likelihood: circle,
+//! ellipse, two contours that have nothing to do with each other. For the likeliest pair a round bar with the clicked
+//! outline is looked for, and weighed on all four outlines against a flat ring. A model is accepted when everything
+//! that would lead to another grasp is out of the question ([`MOST_WRONG`]); otherwise the refusal names what could
+//! not be excluded.
 
 use crate::offline::bar::search;
 use crate::offline::contour::select::Candidate;
@@ -52,11 +53,11 @@ impl From<Refusal> for Unpaired {
 
 /// Probability of a wrong grasp that is accepted: one in a thousand selections, as the specification has it.
 const MOST_WRONG: f64 = 1e-3;
-/// Probability of unrelated contours up to which a pair is taken: their prior already counts every neighbour of the contour that was meant, and one
-/// selection in twenty is mistaken at all.
+/// Probability of unrelated contours up to which a pair is taken: their prior already counts every neighbour of the
+/// contour that was meant, and one selection in twenty is mistaken at all.
 const MOST_UNRELATED: f64 = 0.02;
-/// What a difference of the brighter side costs, pixels of click distance: two images of one edge hardly ever differ in it, except against
-/// another background.
+/// What a difference of the brighter side costs, pixels of click distance: two images of one edge hardly ever differ
+/// in it, except against another background.
 const OTHER_SIDE: f64 = 12.0;
 /// A hand's click is off by so many pixels (the scale of an exponential).
 const CLICK_PX: f64 = 2.0;
@@ -70,7 +71,8 @@ const BAR_PAIRS: usize = 8;
 const OTHER_OUTLINE_PLACES: f64 = 16.0;
 /// Part of a bar's other outline that carries edges: hub, spokes and what stands before it hide the rest.
 const OTHER_OUTLINE_SEEN: f64 = 0.75;
-/// Logarithm of the probability that a bar's outlines cannot be followed although they are there: 6 of 400 rendered bare wheels.
+/// Logarithm of the probability that a bar's outlines cannot be followed although they are there: 6 of 400 rendered
+/// bare wheels.
 const LOG_NOT_FOLLOWED: f64 = -4.2;
 /// Smooth edge error up to which a circle is a clean one, pixels: what edges on their own have.
 const CLEAN_PX: f64 = 0.1;
@@ -250,7 +252,8 @@ fn bar_or_plane(
     plane_pair(best, log_alone, rig, options).map(Some)
 }
 
-/// Distance of centres, metres, and angle of normals, radians, from which two models lead to different grasps: half of what the jaws forgive.
+/// Distance of centres, metres, and angle of normals, radians, from which two models lead to different grasps: half
+/// of what the jaws forgive.
 const SAME_CENTRE_M: f64 = 1e-3;
 const SAME_NORMAL_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
 
@@ -275,7 +278,8 @@ fn is_thick(bar: &Fitted) -> bool {
 /// Bars with the clicked outlines.
 struct Bars {
     bars: Vec<FourOutlines>,
-    /// Logarithm of how much less likely a bar is for its other outline not being where one of any thickness would have it.
+    /// Logarithm of how much less likely a bar is for its other outline not being where one of any thickness would
+    /// have it.
     log_unseen: f64,
 }
 

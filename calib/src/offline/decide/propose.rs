@@ -28,7 +28,8 @@ impl Proposal {
 const SEEDS: usize = 120;
 /// Part of an ellipse that has to carry edges.
 const COVERED: f64 = 0.5;
-/// Part that has to carry edges before a trial ellipse is settled on the edges that it gathers: less than in the end, as settling gathers more.
+/// Part that has to carry edges before a trial ellipse is settled on the edges that it gathers: less than in the end,
+/// as settling gathers more.
 const PROMISING: f64 = 0.4;
 /// Ellipses kept of a view.
 const KEPT: usize = 40;
@@ -72,7 +73,8 @@ fn worth(c: &Contour) -> f64 {
     c.coverage * c.coverage * (c.points.len() as f64).sqrt() / (0.15 + c.rms_px)
 }
 
-/// Pairs the ellipses of both views that reconstruct to a rim, best first, at most `most`. `watch` is told what part of the work is done.
+/// Pairs the ellipses of both views that reconstruct to a rim, best first, at most `most`. `watch` is told what part
+/// of the work is done.
 pub fn propose(
     views: &[ViewEdges<'_>; 2],
     p: [&Projection; 2],

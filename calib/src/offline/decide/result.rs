@@ -10,8 +10,8 @@ use crate::offline::rim::reconstruct::base_report;
 use crate::offline::rim::refusal::Refusal;
 use nalgebra::{DMatrix, Matrix2, Matrix2x3, Matrix3, SMatrix, SVector, Vector2, Vector3};
 
-/// Where a gripper's marks stand on the grasp: at this distance from the axis and this far before the rim's plane, metres. Marks farther from
-/// the rim see less of its depth error cancelled.
+/// Where a gripper's marks stand on the grasp: at this distance from the axis and this far before the rim's plane,
+/// metres. Marks farther from the rim see less of its depth error cancelled.
 const MARKS_ASIDE_M: f64 = 0.05;
 const MARKS_BEFORE_M: f64 = 0.08;
 /// Number of places on that circle.
@@ -19,7 +19,8 @@ const MARKS: usize = 8;
 
 /// Builds the reconstruction of a fitted model.
 ///
-/// `points` are the points of each view in the order of the report's residuals; `stretches` say to which of them each residual belongs.
+/// `points` are the points of each view in the order of the report's residuals; `stretches` say to which of them each
+/// residual belongs.
 pub(in crate::offline) fn reconstruction(
     fitted: &Fitted,
     scores: Vec<Score>,
@@ -102,11 +103,11 @@ fn place_residuals(
     }
 }
 
-/// Motion of a gripper whose marks stay at their places in both images while the cameras change by each of the rig's modes: translation at the
-/// rim's centre and rotation.
+/// Motion of a gripper whose marks stay at their places in both images while the cameras change by each of the rig's
+/// modes: translation at the rim's centre and rotation.
 ///
-/// With `J` the marks' derivative by the gripper's pose, a mode `dP` moves the pose that the images show by `xi = -J^+ dP x`. `None` where
-/// the images do not determine the pose.
+/// With `J` the marks' derivative by the gripper's pose, a mode `dP` moves the pose that the images show by `xi =
+/// -J^+ dP x`. `None` where the images do not determine the pose.
 fn pose_by_modes(rim: &Rim, p: &[Projection; 2], rig: &RigError) -> Option<Vec<SVector<f64, 6>>> {
     let f = frame_of(&rim.normal);
     let marks: Vec<Vector3<f64>> = (0..MARKS)
@@ -142,8 +143,9 @@ fn pose_by_modes(rim: &Rim, p: &[Projection; 2], rig: &RigError) -> Option<Vec<S
     Some(right.iter().map(|r| solve.solve(r)).collect())
 }
 
-/// Standard deviations of centre and normal *as the loop reaches them*: of the rim relative to a gripper whose marks are at their predicted
-/// places in both images. A rig error moves rim and marks alike; what remains is the covariance of `delta - xi phi`.
+/// Standard deviations of centre and normal *as the loop reaches them*: of the rim relative to a gripper whose marks
+/// are at their predicted places in both images. A rig error moves rim and marks alike; what remains is the
+/// covariance of `delta - xi phi`.
 fn in_images(fitted: &Fitted, rim: &Rim, rig: &RigError) -> (f64, f64) {
     let p = [0, 1].map(|k| corrected(rig, &fitted.phi, k));
     let Some(motion) = pose_by_modes(rim, &p, rig) else { return (f64::INFINITY, f64::INFINITY) };
@@ -166,8 +168,8 @@ fn in_images(fitted: &Fitted, rim: &Rim, rig: &RigError) -> (f64, f64) {
     ((cov[(0, 0)] + cov[(1, 1)] + cov[(2, 2)]).sqrt(), (cov[(3, 3)] + cov[(4, 4)]).sqrt())
 }
 
-/// By how much two models of the same contours lead to different grasps: distance of the centres and angle of the normals, as the loop reaches
-/// them.
+/// By how much two models of the same contours lead to different grasps: distance of the centres and angle of the
+/// normals, as the loop reaches them.
 pub(in crate::offline) fn apart(a: &Fitted, b: &Fitted, rig: &RigError) -> (f64, f64) {
     let (Some(s), Some(t)) = (a.shapes.first(), b.shapes.first()) else { return (f64::INFINITY, f64::INFINITY) };
     let (_, rim, _) = rim_of(s);

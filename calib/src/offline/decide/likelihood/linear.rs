@@ -1,5 +1,5 @@
-//! The linear model of all edge points at one state: how each residual changes with the shapes, the rig and a displacement of unrelated
-//! contours.
+//! The linear model of all edge points at one state: how each residual changes with the shapes, the rig and a
+//! displacement of unrelated contours.
 
 use super::shape::{Place, SHAPE};
 use super::{Hypothesis, OUTLIER_SIGMAS, Shape, Stretch, corrected, solve};
@@ -10,8 +10,8 @@ use crate::offline::rim::cone::camera_centre;
 use crate::offline::rim::model::Projection;
 use nalgebra::{DMatrix, DVector, Vector2, Vector3};
 
-/// How far the second edge of a flat ring lies from coaxial with the first: across and along the axis as a fraction of the radius, and in
-/// direction, radians.
+/// How far the second edge of a flat ring lies from coaxial with the first: across and along the axis as a fraction
+/// of the radius, and in direction, radians.
 const COAXIAL: [f64; 3] = [0.005, 0.05, 0.005];
 /// How far the radius of the second edge differs from the first, as a fraction of it: what a bar's diameter may be.
 const RING_WIDTH: f64 = 0.15;
@@ -84,14 +84,14 @@ impl Linear {
         first: usize,
     ) {
         let (sd, off) = shape.prior();
-        for k in 0..shape.parameters() {
-            self.unit[at + k] = sd[k];
-            self.offset[at + k] = off[k];
+        let count = shape.parameters();
+        for (own, all) in [(&mut self.unit, &sd), (&mut self.offset, &off)] {
+            own.iter_mut().skip(at).zip(all).take(count).for_each(|(o, v)| *o = *v);
         }
         for i in first..self.places.len() {
             let place = self.places[i];
             let moves = shape.moves(&place.foot);
-            for k in 0..shape.parameters() {
+            for k in 0..count {
                 self.columns[(i, at + k)] = place.by_motion(&moves[k], p) * sd[k];
             }
             for (j, mode) in rig.modes.iter().enumerate() {
@@ -142,7 +142,8 @@ impl Linear {
         }
     }
 
-    /// Another contour than the left one's lies elsewhere across the epipolar lines, and is of another height over them.
+    /// Another contour than the left one's lies elsewhere across the epipolar lines, and is of another height over
+    /// them.
     fn by_displacement(&mut self, s: &Stretch, p: &[Projection; 2], px: f64, at: usize, first: usize) -> Option<()> {
         let middle = s.points.iter().map(|q| q.uv).sum::<Vector2<f64>>() / s.points.len().max(1) as f64;
         let epipole = p[1] * camera_centre(&p[0])?.push(1.0);
@@ -188,7 +189,8 @@ impl Linear {
         Some(())
     }
 
-    /// Points that belong to the outline, as far as the present fit can say: the first fit believes the rig and is off as a whole.
+    /// Points that belong to the outline, as far as the present fit can say: the first fit believes the rig and is
+    /// off as a whole.
     pub(super) fn used(&self, kappa: f64, round: usize) -> Vec<bool> {
         let each = || self.places.iter().zip(&self.sigma).map(|(p, s)| (p.residual.abs(), *s));
         let scale = 1.48 * median(each().map(|(r, s)| r / s).collect());

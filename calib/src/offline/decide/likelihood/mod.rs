@@ -6,11 +6,12 @@
 //! r_i(theta, phi) = e_i + B_i a,    e_i ~ N(0, kappa^2 sigma_i^2),    a ~ N(0, s^2),    phi ~ N(0, I)
 //! ```
 //!
-//! `theta` is the shape, `phi` what is unknown of the rig ([`RigError::modes`](crate::offline::correspondence::rig_error::RigError)), and
-//! `B a` the part of the edge error that varies smoothly round a contour (blur, shading, a neighbouring edge), as a short Fourier series for
-//! each contour. `kappa` and `s` are estimated with the rest, under a prior. Everything is linear at the optimum, so that one normal matrix
-//! gives the estimate, the covariance of shape and rig together, chi-squared and the evidence `p(points | model)` by Laplace's method.
-//! Derived in `docs/PAPER.md`, "One likelihood".
+//! `theta` is the shape, `phi` what is unknown of the rig
+//! ([`RigError::modes`](crate::offline::correspondence::rig_error::RigError)), and `B a` the part of the edge error
+//! that varies smoothly round a contour (blur, shading, a neighbouring edge), as a short Fourier series for each
+//! contour. `kappa` and `s` are estimated with the rest, under a prior. Everything is linear at the optimum, so that
+//! one normal matrix gives the estimate, the covariance of shape and rig together, chi-squared and the evidence
+//! `p(points | model)` by Laplace's method. Derived in `docs/PAPER.md`, "One likelihood".
 
 mod linear;
 mod shape;
@@ -50,7 +51,8 @@ pub(in crate::offline) struct Fitted {
     pub(in crate::offline) shapes: Vec<Shape>,
     /// Logarithm of the evidence, up to a constant of the points.
     pub(in crate::offline) log_evidence: f64,
-    /// Squared residuals in their own covariance, priors included: chi-squared with about `dof` degrees of freedom for a right model.
+    /// Squared residuals in their own covariance, priors included: chi-squared with about `dof` degrees of freedom
+    /// for a right model.
     pub(in crate::offline) chi2: f64,
     /// Degrees of freedom.
     pub(in crate::offline) dof: f64,
@@ -60,11 +62,13 @@ pub(in crate::offline) struct Fitted {
     pub(in crate::offline) wave_px: f64,
     /// Expected rig error in units of the modes.
     pub(in crate::offline) phi: DVector<f64>,
-    /// Covariance of the first shape (centre, normal in `frame_of`, shape; natural units) and of the rig's modes after it.
+    /// Covariance of the first shape (centre, normal in `frame_of`, shape; natural units) and of the rig's modes
+    /// after it.
     pub(in crate::offline) cov: DMatrix<f64>,
     /// Number of the first shape's parameters.
     pub(in crate::offline) parameters: usize,
-    /// Residual of each point with the estimated rig error put right, pixels, and whether it was used; in the stretches' order.
+    /// Residual of each point with the estimated rig error put right, pixels, and whether it was used; in the
+    /// stretches' order.
     pub(in crate::offline) residuals: Vec<(f64, bool)>,
 }
 
@@ -73,8 +77,8 @@ pub(in crate::offline) struct Fitted {
 pub(in crate::offline) struct Hypothesis {
     /// The shapes that the stretches belong to.
     pub(in crate::offline) shapes: Vec<Shape>,
-    /// Standard deviation, pixels, of how far a contour of the right image lies from where the left one's shape puts it, across and in height
-    /// over the epipolar lines. `None` if both are pictures of one shape.
+    /// Standard deviation, pixels, of how far a contour of the right image lies from where the left one's shape puts
+    /// it, across and in height over the epipolar lines. `None` if both are pictures of one shape.
     pub(in crate::offline) unrelated_px: Option<f64>,
 }
 
@@ -98,10 +102,11 @@ fn explains(stretches: &[Stretch], used: &[bool]) -> bool {
 
 /// Fits a hypothesis to contours. `None` where it leads nowhere (a shape collapses, a point has no residual).
 ///
-/// A rig file is right as it stands, or it has an error of which the images of the pair leave a part open; the matches say which of both is the
-/// likelier ([`RigError::log_odds_given`]), and so do the contours. The evidence is that of the mixture. The estimate is that of the likelier: an
-/// error that is not there would only let the noise of matches and edges into directions that a good rig determines better. The covariance
-/// is that of the unknown rig, taken about the estimate, since a rig that seems right may still be wrong where nothing shows it.
+/// A rig file is right as it stands, or it has an error of which the images of the pair leave a part open; the
+/// matches say which of both is the likelier ([`RigError::log_odds_given`]), and so do the contours. The evidence is
+/// that of the mixture. The estimate is that of the likelier: an error that is not there would only let the noise of
+/// matches and edges into directions that a good rig determines better. The covariance is that of the unknown rig,
+/// taken about the estimate, since a rig that seems right may still be wrong where nothing shows it.
 pub(in crate::offline) fn fit(hypothesis: &Hypothesis, stretches: &[Stretch], rig: &RigError) -> Option<Fitted> {
     let free = fit_rig(hypothesis, stretches, rig)?;
     if rig.modes.is_empty() {
@@ -123,7 +128,8 @@ pub(in crate::offline) fn fit(hypothesis: &Hypothesis, stretches: &[Stretch], ri
     Some(Fitted { log_evidence, ..free.about(estimate, phi) })
 }
 
-/// A fit with everything unknown: its covariance about the solution with waves, which is a step away from the least squares of the shapes.
+/// A fit with everything unknown: its covariance about the solution with waves, which is a step away from the least
+/// squares of the shapes.
 struct Free {
     fitted: Fitted,
     step: DVector<f64>,
@@ -153,11 +159,12 @@ fn fit_rig(hypothesis: &Hypothesis, stretches: &[Stretch], rig: &RigError) -> Op
         let linear = Linear::new(hypothesis, &shapes, (&phi, &displaced), stretches, rig)?;
         let used = linear.used(kappa, round);
         let sums = Sums::new(&linear, &used);
-        // The estimate is least squares without the waves; what they would move it by goes into its covariance. On real edges, which have
-        // more to them than a few waves, it is the better of the two.
+        // The estimate is least squares without the waves; what they would move it by goes into its covariance. On
+        // real edges, which have more to them than a few waves, it is the better of the two.
         let solved = sums.solve(&linear, NO_WAVES, kappa)?;
         kappa = solved.kappa;
-        // Directions that hardly anything determines may creep on; the last round's answer is as good as the next one's.
+        // Directions that hardly anything determines may creep on; the last round's answer is as good as the next
+        // one's.
         if round + 1 == ROUNDS || round >= 2 && solved.size() < CONVERGED {
             if !explains(stretches, &used) {
                 return None;

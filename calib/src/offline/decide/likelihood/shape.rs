@@ -1,4 +1,5 @@
-//! What contours may be pictures of: a plane circle or ellipse, a round bar; where their outlines lie, and how parameters move them.
+//! What contours may be pictures of: a plane circle or ellipse, a round bar; where their outlines lie, and how
+//! parameters move them.
 
 use crate::offline::bar::torus::{Torus, rays};
 use crate::offline::conic::sampson::distance;
@@ -7,8 +8,8 @@ use crate::offline::rim::circle::{frame_of, signed_axis};
 use crate::offline::rim::model::{EdgePoint, Projection, Rim};
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 
-/// Usual radius of a bar as a fraction of its ring's, and how far bars differ from it, as a natural logarithm: hand wheels, handles and pipes
-/// lie between a thirtieth and a half.
+/// Usual radius of a bar as a fraction of its ring's, and how far bars differ from it, as a natural logarithm: hand
+/// wheels, handles and pipes lie between a thirtieth and a half.
 const USUAL_BAR: f64 = 0.12;
 const BAR_SPREAD: f64 = 0.6;
 /// Parameters of a shape at most.
@@ -21,7 +22,8 @@ pub(in crate::offline) enum Shape {
     Circle(Rim),
     /// A plane ellipse, and how far it is from round: standard deviation of its unevenness as a fraction of its size.
     Ellipse(Rim, f64),
-    /// A round bar; and where somebody said it, its radius with the relative uncertainty of that. The fitted parameter is the radius' logarithm.
+    /// A round bar; and where somebody said it, its radius with the relative uncertainty of that. The fitted
+    /// parameter is the radius' logarithm.
     Bar(Torus, Option<(f64, f64)>),
 }
 
@@ -55,9 +57,9 @@ impl Shape {
         }
     }
 
-    /// Standard deviation of each parameter before anything is seen, natural units, and how far the present value is from the prior's mean
-    /// in them. Place and direction are as good as free; what tells models from each other is how far an ellipse is from round and how thick
-    /// a bar is.
+    /// Standard deviation of each parameter before anything is seen, natural units, and how far the present value is
+    /// from the prior's mean in them. Place and direction are as good as free; what tells models from each other is
+    /// how far an ellipse is from round and how thick a bar is.
     pub(super) fn prior(&self) -> ([f64; SHAPE], [f64; SHAPE]) {
         let (reach, size) = (self.centre().norm(), self.size());
         let mut sd = [reach, reach, reach, 1.0, 1.0, 0.5 * size, 0.0, 0.0];
@@ -79,8 +81,8 @@ impl Shape {
         (sd, off)
     }
 
-    /// The shape moved by natural parameters: centre, normal turned towards `frame_of`'s axes, radius (and its unevenness along and between
-    /// those axes), or core and bar radius.
+    /// The shape moved by natural parameters: centre, normal turned towards `frame_of`'s axes, radius (and its
+    /// unevenness along and between those axes), or core and bar radius.
     pub(super) fn moved(&self, d: &[f64; SHAPE]) -> Option<Self> {
         let f = frame_of(&self.normal());
         let normal = (self.normal() + f.column(0) * d[3] + f.column(1) * d[4]).try_normalize(0.1)?;
@@ -121,7 +123,8 @@ impl Shape {
         d
     }
 
-    /// Where points of a view lie about the shape's outline there. `None` where a camera or the shape's image is degenerate.
+    /// Where points of a view lie about the shape's outline there. `None` where a camera or the shape's image is
+    /// degenerate.
     pub(super) fn places(&self, points: &[EdgePoint], p: &Projection) -> Option<Vec<Place>> {
         match self {
             Self::Circle(r) | Self::Ellipse(r, _) => {

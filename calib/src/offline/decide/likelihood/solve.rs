@@ -1,11 +1,12 @@
-//! Solution of the linear model for one size of the edge noise and of the smooth edge error, and the search for both sizes.
+//! Solution of the linear model for one size of the edge noise and of the smooth edge error, and the search for both
+//! sizes.
 
 use super::linear::Linear;
 use super::{OUTLIER_SIGMAS, Stretch};
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 
-/// Waves of smooth edge error round a contour, relative to each other, by number of periods: slow ones move whole outlines and are the rule,
-/// quick ones come from shading here and there.
+/// Waves of smooth edge error round a contour, relative to each other, by number of periods: slow ones move whole
+/// outlines and are the rule, quick ones come from shading here and there.
 const WAVES: [f64; 7] = [1.0, 1.0, 0.6, 0.4, 0.3, 0.3, 0.3];
 /// Columns of a contour's waves: one constant, a cosine and a sine for each period.
 const COLUMNS: usize = 2 * WAVES.len() - 1;
@@ -163,7 +164,8 @@ impl Whole<'_> {
         Some(out)
     }
 
-    /// The linear model for a size of the smooth error; the noise of the points is brought to its best value from a start.
+    /// The linear model for a size of the smooth error; the noise of the points is brought to its best value from a
+    /// start.
     fn solve(&self, linear: &Linear, wave_px: Option<f64>, start: f64) -> Option<Solved> {
         let sums = self.sums;
         let width = sums.gradient.len();
@@ -215,7 +217,8 @@ impl Whole<'_> {
         best
     }
 
-    /// The same for the size of the smooth error that explains the points best: uphill from the usual one, since the evidence has one maximum.
+    /// The same for the size of the smooth error that explains the points best: uphill from the usual one, since the
+    /// evidence has one maximum.
     pub(super) fn best_noise(&self, linear: &Linear, kappa: f64) -> Option<Solved> {
         let usual = WAVE_PX.iter().position(|w| *w >= USUAL_WAVE_PX)?;
         let size = |at: usize| WAVE_PX.get(at).copied();
