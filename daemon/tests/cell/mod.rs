@@ -234,7 +234,12 @@ impl World {
         loop {
             let (state, cause) = self.state();
             if state == "fault" || (state == "armed" && cause.starts_with("H-")) {
-                return std::fs::read_to_string(self.folder.join("graspd.log")).unwrap();
+                // The log is written by a thread of its own, a little behind the state.
+                let log = std::fs::read_to_string(self.folder.join("graspd.log")).unwrap();
+                let last = log.lines().rfind(|l| l.contains(" -> ")).unwrap_or_default();
+                if last.contains(&format!(" -> {state}")) {
+                    return log;
+                }
             }
             assert!(Instant::now() < until, "still {state}: {cause}");
             std::thread::sleep(Duration::from_millis(50));
