@@ -143,7 +143,11 @@ fn one_click_a_view_finds_the_rear_rim_as_well_as_the_reference_does() {
                 rim.b / rim.a
             );
             assert_eq!(p.file.object.model, model);
-            assert!(c < reference["centre_mm"][0].as_f64().unwrap() + 1.0 && n < worst_deg, "{c} mm {n} degrees");
+            // What the images leave open of the rig is a few millimetres of depth at this distance, and has to be admitted.
+            let sigma_mm = report.sigma_centre * 1e3;
+            let most = reference["centre_mm"][0].as_f64().unwrap() + 2.5;
+            assert!(c < most && n < worst_deg, "{c} mm of {most}, {n} degrees");
+            assert!(c < 3.5 * sigma_mm, "{c} mm, sigma {sigma_mm}");
             assert!(n < 3.5 * sigma, "{n} degrees, sigma {sigma}");
             if choice == RimChoice::Ellipse {
                 assert!((rim.b / rim.a - ratio(truth)).abs() < 0.006);
