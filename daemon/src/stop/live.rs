@@ -119,12 +119,12 @@ impl Live {
         Some(self.verdict.load(Ordering::Acquire)).filter(|code| *code != NO_VERDICT)
     }
 
-    /// The daemon has been taken apart.
+    /// The daemon has ended.
     pub fn close(&self) {
         self.over.store(true, Ordering::Release);
     }
 
-    /// Whether the daemon has been taken apart.
+    /// Whether the daemon has ended.
     pub fn over(&self) -> bool {
         self.over.load(Ordering::Acquire)
     }

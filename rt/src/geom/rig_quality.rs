@@ -1,9 +1,11 @@
-//! How wrong a calibrated rig may be, and what that does to the images: angles of view, from which every gate in pixels follows.
+//! How wrong a calibrated rig may be, and what that does to the images: angles of view, from which every gate in
+//! pixels follows.
 //!
-//! Nine unknowns describe a rig that is off from what its file says: the right camera turned about its own centre (three), both
-//! focal lengths (common and half the difference), both principal points (four). A relative error of the baseline's length only
-//! scales what is seen; an error of its direction looks, at one distance, like a turn. The unknowns are taken as independent and
-//! normal, with the deviations of a [`RigError`]; everything is linear in them, since they are small.
+//! Nine unknowns describe a rig that is off from what its file says: the right camera turned about its own centre
+//! (three), both focal lengths (common and half the difference), both principal points (four). A relative error of
+//! the baseline's length only scales what is seen; an error of its direction looks, at one distance, like a turn. The
+//! unknowns are taken as independent and normal, with the deviations of a [`RigError`]; everything is linear in them,
+//! since they are small.
 
 use super::{Pixel, Pose, Rig, Vec3, View, exp_twist};
 use crate::math;
@@ -12,8 +14,8 @@ use nalgebra::{Matrix2x3, SMatrix, SVector, Vector2, Vector6};
 /// Number of unknowns of a rig's error.
 pub const RIG_UNKNOWNS: usize = 9;
 
-/// The unknowns, in order: turn of the right camera about its own x, y, z (rad); focal lengths, common and half the difference
-/// right minus left (relative); principal points, left u, v and right u, v (pixels).
+/// The unknowns, in order: turn of the right camera about its own x, y, z (rad); focal lengths, common and half the
+/// difference right minus left (relative); principal points, left u, v and right u, v (pixels).
 pub type RigOffset = SVector<f64, RIG_UNKNOWNS>;
 
 /// Derivative of a pixel by a [`RigOffset`].
@@ -21,7 +23,8 @@ pub type RigJacobian = SMatrix<f64, 2, RIG_UNKNOWNS>;
 
 /// Standard deviations of a rig's own error.
 ///
-/// The default is what a careful calibration with a printed target leaves, and what is assumed of a rig whose file states nothing.
+/// The default is what a careful calibration with a printed target leaves, and what is assumed of a rig whose file
+/// states nothing.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RigError {
     /// Relative rotation of the cameras, about each axis, rad. Default 0.1 degrees.
@@ -67,8 +70,8 @@ impl RigError {
         math::sqrt(offset.component_div(&self.deviations().map(|d| d.max(1e-12))).norm_squared())
     }
 
-    /// Deviation of the distance of a mark's image from the epipolar line of its other image, pixels, for a point of the left
-    /// frame. `None` where it is behind a camera, or on the line through both.
+    /// Deviation of the distance of a mark's image from the epipolar line of its other image, pixels, for a point of
+    /// the left frame. `None` where it is behind a camera, or on the line through both.
     pub fn epipolar_sigma_px(&self, rig: &Rig, x_left: &Vec3) -> Option<f64> {
         let (normal, left, right) = epipolar_normal(rig, x_left)?;
         let across = left.tr_mul(&normal[0]) + right.tr_mul(&normal[1]);
@@ -78,15 +81,16 @@ impl RigError {
     }
 }
 
-/// The direction of the four image coordinates of a point that no displacement of the point changes, with the derivative of each
-/// view's pixel by the unknowns.
+/// The direction of the four image coordinates of a point that no displacement of the point changes, with the
+/// derivative of each view's pixel by the unknowns.
 fn epipolar_normal(rig: &Rig, x_left: &Vec3) -> Option<([Vector2<f64>; 2], RigJacobian, RigJacobian)> {
     let (_, gl) = rig.project_with_jacobian(View::Left, x_left)?;
     let (_, gr) = rig.project_with_jacobian(View::Right, x_left)?;
     let (_, jl) = rig.project_with_offset(View::Left, x_left)?;
     let (_, jr) = rig.project_with_offset(View::Right, x_left)?;
-    // The direction of the point's motion along the left ray leaves the left image alone: its right image moves along the
-    // epipolar line, and across that line is the right part of the normal. The left part balances the point's other motions.
+    // The direction of the point's motion along the left ray leaves the left image alone: its right image moves along
+    // the epipolar line, and across that line is the right part of the normal. The left part balances the point's
+    // other motions.
     let along = gr * x_left;
     let across = Vector2::new(-along.y, along.x);
     let length = math::sqrt(across.norm_squared());
@@ -184,7 +188,8 @@ mod tests {
         }
     }
 
-    /// The predicted deviation is the one that rigs drawn from the prior have: distance of the right image from the epipolar line.
+    /// The predicted deviation is the one that rigs drawn from the prior have: distance of the right image from the
+    /// epipolar line.
     #[test]
     fn the_epipolar_deviation_is_that_of_drawn_rigs() {
         let (rig, error) = (rig(), RigError::default());

@@ -1,13 +1,15 @@
 //! The only way out: every rate that reaches the wire has passed through [`Guard::step`].
 //!
-//! It trusts nothing that computed the rates. Whatever comes in, numbers that are none included, what goes out is finite, within
-//! joint speed, joint acceleration and gripper speed, and leaves the arm able to stop before every joint's end. Limits are kept
-//! by slowing the whole motion, never by clipping single joints, so that its direction stays.
+//! It trusts nothing that computed the rates. Whatever comes in, numbers that are none included, what goes out is
+//! finite, within joint speed, joint acceleration and gripper speed, and leaves the arm able to stop before every
+//! joint's end. Limits are kept by slowing the whole motion, never by clipping single joints, so that its direction
+//! stays.
 //!
-//! How it knows that it can always stop: the *stop ramp* shrinks all rates together to zero at the acceleration limit. A step
-//! towards the wanted rates is taken only if the stop ramp from there still ends inside the joints' ranges; otherwise the
-//! step taken is the stop ramp's own. A ramp that was possible at the last step is possible now, so by induction there is
-//! always one. A short mean over the last steps bounds the jerk; a mean of vectors within a (convex) limit is within it.
+//! How it knows that it can always stop: the *stop ramp* shrinks all rates together to zero at the acceleration
+//! limit. A step towards the wanted rates is taken only if the stop ramp from there still ends inside the joints'
+//! ranges; otherwise the step taken is the stop ramp's own. A ramp that was possible at the last step is possible
+//! now, so by induction there is always one. A short mean over the last steps bounds the jerk; a mean of vectors
+//! within a (convex) limit is within it.
 
 mod limits;
 
@@ -71,7 +73,8 @@ pub struct Guard {
     stopping: bool,
 }
 
-/// Share of the gripper's speed cap that is aimed at: what the arm's turning adds within one filter length is kept for it.
+/// Share of the gripper's speed cap that is aimed at: what the arm's turning adds within one filter length is kept
+/// for it.
 const TCP_AIM: f64 = 0.95;
 /// Share of the way to a joint's end at which a motion is slowed, before the fallback has to.
 const POSITION_AIM: f64 = 0.8;
@@ -99,8 +102,9 @@ impl Guard {
 
     /// One step towards `wanted` (rad/s).
     ///
-    /// `q` are measured joint positions, `jacobian` the body Jacobian at the gripper there, `share` (0 to 1) lowers the speed
-    /// caps (reduced mode, probe), `dt_s` is the real time since the last step; more than one period counts as one.
+    /// `q` are measured joint positions, `jacobian` the body Jacobian at the gripper there, `share` (0 to 1) lowers
+    /// the speed caps (reduced mode, probe), `dt_s` is the real time since the last step; more than one period counts
+    /// as one.
     pub fn step(&mut self, wanted: &Joints, q: &Joints, jacobian: &Matrix6<f64>, share: f64, dt_s: f64) -> Guarded {
         self.stopping = false;
         let dt = self.usable(dt_s);
@@ -134,11 +138,11 @@ impl Guard {
         Guarded { rates: self.emit(dt), held, scale }
     }
 
-    /// One step of the stop ramp from what was sent last: all rates shrink together at the acceleration limit, their norm never
-    /// grows, and rest is reached within [`Limits::ramp_ns`] and stays.
+    /// One step of the stop ramp from what was sent last: all rates shrink together at the acceleration limit, their
+    /// norm never grows, and rest is reached within [`Limits::ramp_ns`] and stays.
     ///
-    /// The first step of a stop is taken from the rates on the wire, not from inside the jerk filter, so that an arm that was
-    /// speeding up slows down at once; in that one step the jerk limit gives way to the stop.
+    /// The first step of a stop is taken from the rates on the wire, not from inside the jerk filter, so that an arm
+    /// that was speeding up slows down at once; in that one step the jerk limit gives way to the stop.
     pub fn stop(&mut self, dt_s: f64) -> Guarded {
         let dt = self.usable(dt_s);
         if !self.stopping {
@@ -203,7 +207,8 @@ impl Guard {
         self.limits.reaction_s + self.limits.period_s * (2.0 + 0.5 * self.limits.filter as f64)
     }
 
-    /// Whether a stop ramp from `rates` at `q` ends inside every joint's range. Motion away from an end is always allowed.
+    /// Whether a stop ramp from `rates` at `q` ends inside every joint's range. Motion away from an end is always
+    /// allowed.
     fn can_stop(&self, rates: &Joints, q: &Joints) -> bool {
         let fastest = rates.iter().fold(0.0_f64, |m, v| m.max(math::fabs(*v)));
         let seconds = fastest / (2.0 * self.limits.acceleration) + self.dead_s();

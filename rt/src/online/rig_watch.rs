@@ -1,14 +1,15 @@
 //! Notices that a camera was moved: docs/HEALTH.md derives this.
 //!
-//! A Kalman filter holds the gripper's pose in the rig and the rig's own offset. Between two frames the pose moves as the encoders
-//! say, with an uncertainty in proportion to the motion; the offset stays. The rig's unknown error is thereby learnt as a constant,
-//! and what a frame shows beyond it is tested: does a step of the rig explain this frame better than no step, by more than chance?
-//! A second test, blind to the encoders, holds what no pose explains, over a window of frames, against what it was at the start: it
-//! sees steps too small for one frame, drifts, and what happened while the marks were out of sight. Both tests are one function,
-//! the gain in likelihood when the unknowns are allowed to have changed.
+//! A Kalman filter holds the gripper's pose in the rig and the rig's own offset. Between two frames the pose moves as
+//! the encoders say, with an uncertainty in proportion to the motion; the offset stays. The rig's unknown error is
+//! thereby learnt as a constant, and what a frame shows beyond it is tested: does a step of the rig explain this
+//! frame better than no step, by more than chance? A second test, blind to the encoders, holds what no pose explains,
+//! over a window of frames, against what it was at the start: it sees steps too small for one frame, drifts, and what
+//! happened while the marks were out of sight. Both tests are one function, the gain in likelihood when the unknowns
+//! are allowed to have changed.
 //!
-//! A step makes the watch suspicious at once, which stops the arm; what it was is decided at rest, where encoders and images cannot
-//! disagree about a motion: a camera that was moved is still moved then, a disturbance is over.
+//! A step makes the watch suspicious at once, which stops the arm; what it was is decided at rest, where encoders and
+//! images cannot disagree about a motion: a camera that was moved is still moved then, a disturbance is over.
 
 use super::likelihood::{STEP, free_pose, gain, scaled, scaled_score, scaled_vector, set_cross, solve, start};
 use super::pose::MarkTable;
@@ -25,15 +26,17 @@ pub struct RigWatchSettings {
     pub rig_error: RigError,
     /// What a mark is off by for reasons that do not average out over frames, pixels. Default 0.05.
     pub mark_px: f64,
-    /// Share of the motion between two frames that encoders and images may disagree by: mounting, arm model, exposure times.
-    /// Default 0.03.
+    /// Share of the motion between two frames that encoders and images may disagree by: mounting, arm model, exposure
+    /// times. Default 0.03.
     pub motion_share: f64,
     /// The same at rest, metres (a turn by this over 0.1 m). Default 20 um.
     pub rest_m: f64,
-    /// Chi-squared by which a change has to explain a frame, or the window, better; half of it in the frame that confirms. Default 45:
-    /// of the seven degrees of freedom that marks see of a change, chance gives both once in 3 * 10^9 frames.
+    /// Chi-squared by which a change has to explain a frame, or the window, better; half of it in the frame that
+    /// confirms. Default 45: of the seven degrees of freedom that marks see of a change, chance gives both once in 3
+    /// * 10^9 frames.
     pub significant: f64,
-    /// A significant change that leads the gripper astray by less than this is a warning, metres (unit-scaled). Default 0.0005.
+    /// A significant change that leads the gripper astray by less than this is a warning, metres (unit-scaled).
+    /// Default 0.0005.
     pub harmless_m: f64,
     /// Frames in a row that must show a change to make it suspicious: one alone may be a shock. Default 2.
     pub confirm: u32,
@@ -69,7 +72,8 @@ pub struct RigHealth {
     pub shakes: u32,
     /// How far the last of either leads the gripper astray, metres (unit-scaled).
     pub astray_m: f64,
-    /// Evidence of a change: of one step in this frame, and of the window against the start, as shares of what is significant.
+    /// Evidence of a change: of one step in this frame, and of the window against the start, as shares of what is
+    /// significant.
     pub evidence: [f64; 2],
 }
 
@@ -77,14 +81,15 @@ pub struct RigHealth {
 const LEARN_FRAMES: u32 = 6;
 /// Frames after which the offset is what later windows are held against.
 const BASE_FRAMES: u32 = 20;
-/// Share of the offset's covariance that each frame gives back to the stated error: 0.006 px a frame, so that the filter never
-/// believes to know the offset better than marks can be measured.
+/// Share of the offset's covariance that each frame gives back to the stated error: 0.006 px a frame, so that the
+/// filter never believes to know the offset better than marks can be measured.
 const FORGET: f64 = 2e-5;
 /// Fading of the window, frames.
 const WINDOW: f64 = 60.0;
 /// Motion from one frame to the next that is rest, metres (unit-scaled): 6 mm/s at 60 Hz.
 const REST_M: f64 = 1e-4;
-/// Motion since the last trusted frame beyond which the encoders cannot clear a suspicion any more, metres: 3 % of it are 0.6 mm.
+/// Motion since the last trusted frame beyond which the encoders cannot clear a suspicion any more, metres: 3 % of it
+/// are 0.6 mm.
 const UNDECIDED_M: f64 = 0.02;
 /// Motion from one frame to the next that no arm makes: the encoders jumped, and say nothing about the images.
 const ABSURD_M: f64 = 0.1;
@@ -162,8 +167,9 @@ impl RigWatch {
         self.health
     }
 
-    /// Takes the marks of one pair, the pose fitted to them in the rig as its file has it, and the gripper in the robot's base by the
-    /// encoders at capture. Bounded work: three passes over at most 64 marks, a handful of systems of 15 unknowns.
+    /// Takes the marks of one pair, the pose fitted to them in the rig as its file has it, and the gripper in the
+    /// robot's base by the encoders at capture. Bounded work: three passes over at most 64 marks, a handful of
+    /// systems of 15 unknowns.
     pub fn update(
         &mut self,
         rig: &Rig,

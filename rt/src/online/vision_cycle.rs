@@ -1,7 +1,8 @@
 //! One frame after another into gripper poses: predict, measure, solve, look again where it paid, judge.
 //!
-//! The cycle owns everything that is remembered between frames. It never searches the whole picture: when the marks are lost it
-//! says so, and an acquisition (see [`super::acquire`]) done elsewhere hands its pose to [`VisionCycle::seed`].
+//! The cycle owns everything that is remembered between frames. It never searches the whole picture: when the marks
+//! are lost it says so, and an acquisition (see [`super::acquire`]) done elsewhere hands its pose to
+//! [`VisionCycle::seed`].
 
 use super::content::{FreezeWatch, badly_exposed};
 use super::frame::{self, FrameFaults, FrameLimits, FrameReject, LastFrame, StereoFrame};
@@ -30,15 +31,16 @@ pub struct VisionSettings {
     pub max_turn: f64,
     /// Distance always allowed between two poses, metres: noise of a poorly seen gripper. Default 0.004.
     pub jump_margin: f64,
-    /// Largest standard deviation of the gripper's position along any axis, metres; above it the marks count as lost. Default 0.005.
+    /// Largest standard deviation of the gripper's position along any axis, metres; above it the marks count as lost.
+    /// Default 0.005.
     pub max_sigma: f64,
-    /// Largest residual of the used marks that the rig's own error does not explain, pixels; above it this is not the gripper.
-    /// Default 3.
+    /// Largest residual of the used marks that the rig's own error does not explain, pixels; above it this is not the
+    /// gripper. Default 3.
     pub max_residual_px: f64,
     /// The rig's stated error, and when it counts as changed.
     pub rig: RigWatchSettings,
-    /// Fewest different marks that make a pose worth having: three determine one, but then nothing says that one of them is wrong.
-    /// Default 4.
+    /// Fewest different marks that make a pose worth having: three determine one, but then nothing says that one of
+    /// them is wrong. Default 4.
     pub min_marks: usize,
     /// Frames over which lost marks are looked for at the prediction before an acquisition is needed. Default 5.
     pub coast_frames: u32,
@@ -65,14 +67,15 @@ impl Default for VisionSettings {
 /// What the last frame said about the cameras, beside the pose.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct VisionHealth {
-    /// Frames in a row whose mark windows were byte for byte those of the frame before: a frozen picture, if the arm moves \[C03\].
+    /// Frames in a row whose mark windows were byte for byte those of the frame before: a frozen picture, if the arm
+    /// moves \[C03\].
     pub frozen_run: u32,
     /// Whether each view is black, saturated or without contrast \[C12\].
     pub badly_exposed: [bool; 2],
     /// Marks predicted to be visible in each view.
     pub expected: [u8; 2],
-    /// Mean over the marks seen in both views of (measured - predicted) row coordinate, left minus right, pixels: away from its usual
-    /// value when a camera was knocked \[C14\]. Zero when no mark was seen in both.
+    /// Mean over the marks seen in both views of (measured - predicted) row coordinate, left minus right, pixels:
+    /// away from its usual value when a camera was knocked \[C14\]. Zero when no mark was seen in both.
     pub vertical_disparity_px: f64,
 }
 
@@ -130,7 +133,8 @@ impl VisionCycle {
         }
     }
 
-    /// Takes over an acquired pose (`left_from_gripper`); the next frame is searched about it. A pose that is not finite is ignored.
+    /// Takes over an acquired pose (`left_from_gripper`); the next frame is searched about it. A pose that is not
+    /// finite is ignored.
     pub fn seed(&mut self, pose: Pose) {
         if pose.translation.vector.iter().chain(pose.rotation.coords.iter()).all(|v| v.is_finite()) {
             let track = Track { pose, base_from_gripper: None, velocity: Twist::zeros(), at_ns: None, misses: 0 };
@@ -172,10 +176,10 @@ impl VisionCycle {
 
     /// Tracks one stereo pair.
     ///
-    /// `base_from_gripper` is the gripper in the robot's base at capture, by the encoders; only its change from frame to frame is
-    /// used. Without it the track's own velocity predicts, and a change of the rig can be told by the marks alone. A motion that no
-    /// gripper can make is not followed. A result with status [`VisionStatus::Lost`] has no marks, a pose that means nothing, and a
-    /// covariance of a million.
+    /// `base_from_gripper` is the gripper in the robot's base at capture, by the encoders; only its change from frame
+    /// to frame is used. Without it the track's own velocity predicts, and a change of the rig can be told by the
+    /// marks alone. A motion that no gripper can make is not followed. A result with status [`VisionStatus::Lost`]
+    /// has no marks, a pose that means nothing, and a covariance of a million.
     ///
     /// # Errors
     /// [`FrameReject`] when the pair, or the pose found in it, is not to be believed. The caller publishes nothing then, so that the
@@ -275,8 +279,8 @@ impl VisionCycle {
         let mut best = pose::estimate(&self.rig, &self.gripper, table, start, &self.settings.pose).ok()?;
         let dropped = pose::keep_used(table, &best);
         let narrow = (2.0 + 2.0 * best.residual_px).min(self.settings.marks.search_px);
-        // A large disc's centre lies off its outline's middle by an amount that depends on the tilt: predicted with a tilt that was
-        // wrong, all marks are measured anew.
+        // A large disc's centre lies off its outline's middle by an amount that depends on the tilt: predicted with a
+        // tilt that was wrong, all marks are measured anew.
         let turn = (start.rotation.inverse() * best.left_from_gripper.rotation).imag().norm_squared();
         if turn > math::sq(0.5 * REMEASURE_TURN) {
             *table = [[None; MAX_MARKS]; 2];
@@ -303,8 +307,8 @@ impl VisionCycle {
         Some(Solved { estimate: best, sound, inner_residual_px: inner, seen })
     }
 
-    /// What the watch is shown. Single marks that the pose threw out are wrong themselves; but where more than half of a view's marks
-    /// were thrown out it is the view that does not fit, and all that was measured there counts.
+    /// What the watch is shown. Single marks that the pose threw out are wrong themselves; but where more than half
+    /// of a view's marks were thrown out it is the view that does not fit, and all that was measured there counts.
     fn together(&self, seen: &mut MarkTable, used: &MarkTable) {
         for (seen, used) in seen.iter_mut().zip(used) {
             let measured = seen.iter().flatten().count();
@@ -371,7 +375,8 @@ impl VisionCycle {
         }
     }
 
-    /// Full speed needs, in each view, four marks that will still be in the picture three frames on, and half of those that face it.
+    /// Full speed needs, in each view, four marks that will still be in the picture three frames on, and half of
+    /// those that face it.
     fn judge(&mut self, e: &PoseEstimate, velocity: &Twist) -> VisionStatus {
         let soon = e.left_from_gripper * exp_twist(&(velocity * 0.1));
         let mut full = true;

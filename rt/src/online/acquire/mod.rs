@@ -1,12 +1,13 @@
 //! Finding the marks from scratch: no earlier pose, no human.
 //!
-//! Round blobs of both pictures ([`blobs`]) are paired along epipolar lines into points of space ([`pairs`]); triples of points whose
-//! distances are those of three marks propose poses, on which all other marks vote ([`constellation`]); the best few are then
-//! measured in the pictures to sub-pixel and must hold there. A runner-up that holds as well makes the answer ambiguous, and an
-//! ambiguous answer is refused: a gripper taken the wrong way round would be driven into something.
+//! Round blobs of both pictures ([`blobs`]) are paired along epipolar lines into points of space ([`pairs`]); triples
+//! of points whose distances are those of three marks propose poses, on which all other marks vote
+//! ([`constellation`]); the best few are then measured in the pictures to sub-pixel and must hold there. A runner-up
+//! that holds as well makes the answer ambiguous, and an ambiguous answer is refused: a gripper taken the wrong way
+//! round would be driven into something.
 //!
-//! This runs on an ordinary thread, in bounded time (some tens of milliseconds), and allocates nothing either: its memory is an
-//! [`AcquireScratch`] that the caller keeps.
+//! This runs on an ordinary thread, in bounded time (some tens of milliseconds), and allocates nothing either: its
+//! memory is an [`AcquireScratch`] that the caller keeps.
 
 mod blobs;
 mod constellation;
@@ -38,19 +39,23 @@ pub struct AcquireSettings {
     pub min_contrast: f64,
     /// Radius of the smallest and largest mark looked for, pixels. Default 2.5 to 34.
     pub radius_px: [f64; 2],
-    /// The rig's own error: how far a pair may be from the epipolar line and marks from where a right rig had them follows from it.
+    /// The rig's own error: how far a pair may be from the epipolar line and marks from where a right rig had them
+    /// follows from it.
     pub rig_error: RigError,
-    /// Deviations of the epipolar distance that are let through. Default 3.5: one rig in two thousand within the stated error is not.
+    /// Deviations of the epipolar distance that are let through. Default 3.5: one rig in two thousand within the
+    /// stated error is not.
     pub epipolar_sigmas: f64,
     /// Tolerance of distances between marks: metres, and share of the distance. Default 3 mm and 2 %.
     pub distance: [f64; 2],
     /// Fewest marks that must hold in each view. Default 4.
     pub min_marks: usize,
-    /// Largest residual of the final pose with the rig's most probable offset taken out, pixels a degree of freedom. Default 0.75:
-    /// marks measured to half a millimetre give 0.4 at 1.5 m; a handful of other discs that happen to fit gives 1 and more.
+    /// Largest residual of the final pose with the rig's most probable offset taken out, pixels a degree of freedom.
+    /// Default 0.75: marks measured to half a millimetre give 0.4 at 1.5 m; a handful of other discs that happen to
+    /// fit gives 1 and more.
     pub max_residual_px: f64,
-    /// How far off the rig may seem, in deviations of its stated error (root of the sum of squares). Default 5: of nine unknowns
-    /// once in three hundred rigs if the marks saw all nine; they see about five, then once in ten thousand.
+    /// How far off the rig may seem, in deviations of its stated error (root of the sum of squares). Default 5: of
+    /// nine unknowns once in three hundred rigs if the marks saw all nine; they see about five, then once in ten
+    /// thousand.
     pub max_rig_sigmas: f64,
     /// Triples of points compared at most. Default 20 million.
     pub max_triples: u64,
@@ -118,7 +123,8 @@ pub struct Acquisition {
     pub residual_px: f64,
     /// The same with the rig's most probable offset taken out, a degree of freedom.
     pub inner_residual_px: f64,
-    /// How far off the rig seems, in deviations of its stated error (root of the sum of squares over its nine unknowns).
+    /// How far off the rig seems, in deviations of its stated error (root of the sum of squares over its nine
+    /// unknowns).
     pub rig_sigmas: f64,
 }
 
@@ -132,13 +138,14 @@ pub enum AcquireFailure {
         /// Blobs in the left and the right view.
         found: [u8; 2],
     },
-    /// Blobs in both views, but too few pairs along epipolar lines with a mark's size: views swapped, rig calibration wrong, or the
-    /// gripper is in one view only.
+    /// Blobs in both views, but too few pairs along epipolar lines with a mark's size: views swapped, rig calibration
+    /// wrong, or the gripper is in one view only.
     TooFewPairs {
         /// Pairs found.
         found: u16,
     },
-    /// Pairs in space, but no four with the distances of the gripper file: another gripper, wrong mark positions or scale.
+    /// Pairs in space, but no four with the distances of the gripper file: another gripper, wrong mark positions or
+    /// scale.
     NoConstellation,
     /// A pose was proposed, but too few marks hold in the pictures.
     NotVerified {
@@ -147,15 +154,16 @@ pub enum AcquireFailure {
         /// Their residual with the rig's most probable offset taken out, pixels a degree of freedom.
         residual_px: f64,
     },
-    /// The marks fit, but only if the rig is far more wrong than it states: a camera was moved, the calibration is another rig's, or
-    /// the gripper is one of another size.
+    /// The marks fit, but only if the rig is far more wrong than it states: a camera was moved, the calibration is
+    /// another rig's, or the gripper is one of another size.
     RigOff {
         /// How far off the rig seems, in deviations of its stated error.
         sigmas: f64,
         /// Residual with the rig as its file has it, pixels.
         residual_px: f64,
     },
-    /// Two different poses explain the pictures equally well: the mark layout is symmetric, or the mark that tells is hidden.
+    /// Two different poses explain the pictures equally well: the mark layout is symmetric, or the mark that tells is
+    /// hidden.
     Ambiguous {
         /// Marks that hold under either pose.
         seen: [u8; 2],

@@ -1,8 +1,9 @@
 //! A small URScript interpreter: what a controller does with a text that was uploaded to ports 30001 to 30003.
 //!
-//! [`Machine::load`] reads a program (unknown syntax is refused with its line, as at upload), [`Machine::step`] runs one control
-//! step of it: every thread goes on until it has used its controller time. All that a program can see or move outside itself goes
-//! through [`Host`]: registers, joints, outputs, sockets. The interpreter starts no operating-system threads and reads no clock.
+//! [`Machine::load`] reads a program (unknown syntax is refused with its line, as at upload), [`Machine::step`] runs
+//! one control step of it: every thread goes on until it has used its controller time. All that a program can see or
+//! move outside itself goes through [`Host`]: registers, joints, outputs, sockets. The interpreter starts no
+//! operating-system threads and reads no clock.
 //!
 //! How to host it:
 //! - feed each script connection's bytes to a [`Collector`]; it gives whole programs and the `stop program` line;
@@ -17,8 +18,9 @@
 //!   `get_actual_joint_positions_history`, ...) arrive at [`Host::call`] with their arguments bound, and so does whatever name the
 //!   interpreter does not know.
 //!
-//! Rules of the language come from UR's script manual and the behaviour of UR's and SDU's published scripts. Where a robot's
-//! behaviour is not documented, the stricter reading is taken, so that a script which runs here has a better chance there.
+//! Rules of the language come from UR's script manual and the behaviour of UR's and SDU's published scripts. Where a
+//! robot's behaviour is not documented, the stricter reading is taken, so that a script which runs here has a better
+//! chance there.
 
 mod arithmetic;
 mod ast;

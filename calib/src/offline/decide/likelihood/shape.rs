@@ -239,3 +239,64 @@ fn homography(p: &Projection, r: &Rim) -> Matrix3<f64> {
     let m = p.fixed_view::<3, 3>(0, 0);
     Matrix3::from_columns(&[m * r.axis_a * r.a, m * r.axis_b * r.b, m * r.centre + p.column(3)])
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::offline::rim::model::Outline;
+    use crate::offline::rim::synthetic::{rig, rim_points, rim_tilted};
+
+    /// Edge points a little beside the outline of an ellipse that is near every shape of the test.
+    fn near(p: &Projection) -> Vec<EdgePoint> {
+        let other = rim_tilted(Vector3::new(0.02, -0.05, 1.5), 0.5, 1.0, 0.0805, 0.0798);
+        let at = |uv: Vector2<f64>| EdgePoint { uv: uv + Vector2::new(0.2, -0.1), sigma: 0.1, outline: Outline::Outer };
+        rim_points(p, &other, 60).into_iter().map(at).collect()
+    }
+
+    /// Slopes of all residuals by central differences.
+    fn slopes(residuals: impl Fn(f64) -> Vec<f64>, h: f64) -> Vec<f64> {
+        residuals(h).iter().zip(residuals(-h)).map(|(a, b)| (a - b) / (2.0 * h)).collect()
+    }
+
+    fn assert_alike(analytic: impl Iterator<Item = f64>, numeric: &[f64], what: &str) {
+        let largest = numeric.iter().fold(0.0f64, |m, s| m.max(s.abs()));
+        assert!(largest > 0.0, "{what} moves nothing");
+        for (a, n) in analytic.zip(numeric) {
+            // Edges that lie beside the outline have a slope that differs by their distance over its radius of curvature.
+            assert!((a - n).abs() < 0.03 * largest, "{what}: {a} against {n}");
+        }
+    }
+
+    #[test]
+    fn residuals_change_with_shape_and_camera_as_by_finite_differences() {
+        let rim = rim_tilted(Vector3::new(0.02, -0.05, 1.5), 0.5, 1.0, 0.08, 0.0797);
+        let round = Rim { b: rim.a, ..rim };
+        let torus = Torus { centre: rim.centre, normal: rim.normal, core: 0.07, bar: 0.01 };
+        for shape in [Shape::Circle(round), Shape::Ellipse(rim, 0.25), Shape::Bar(torus, None)] {
+            for p in rig(0.5, 1200.0, 1.5) {
+                let points = near(&p);
+                let here = shape.places(&points, &p).unwrap();
+                let residuals = |s: &Shape, p: &Projection| -> Vec<f64> {
+                    s.places(&points, p).unwrap().iter().map(|place| place.residual).collect()
+                };
+                for k in 0..shape.parameters() {
+                    let moved = |by: f64| {
+                        let d = std::array::from_fn(|i| if i == k { by } else { 0.0 });
+                        residuals(&shape.moved(&d).unwrap(), &p)
+                    };
+                    let own = here.iter().map(|place| place.by_motion(&shape.moves(&place.foot)[k], &p));
+                    assert_alike(own, &slopes(moved, 1e-6), &format!("{shape:?}, parameter {k}"));
+                }
+                let mut change = Projection::zeros();
+                change.set_row(0, &(p.row(2) * 2.0));
+                change.set_row(1, &(p.row(0) * 1e-3));
+                let own = here.iter().map(|place| place.by_camera(&change, &p));
+                assert_alike(
+                    own,
+                    &slopes(|by| residuals(&shape, &(p + change * by)), 1e-3),
+                    &format!("{shape:?}, camera"),
+                );
+            }
+        }
+    }
+}

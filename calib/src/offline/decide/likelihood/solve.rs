@@ -94,7 +94,7 @@ impl Sums {
         let waves = stretches.iter().map(|s| {
             let rows = first..first + s.points.len();
             first = rows.end;
-            Waves::new(linear, s, rows.zip(&s.place).filter(|(i, _)| used.get(*i).is_some_and(|u| *u)))
+            Waves::new(linear, rows.zip(&s.place).filter(|(i, _)| used.get(*i).is_some_and(|u| *u)))
         });
         Whole { waves: waves.collect(), sums: self }
     }
@@ -106,13 +106,12 @@ impl Sums {
 }
 
 impl Waves {
-    fn new<'a>(linear: &Linear, s: &Stretch, rows: impl Iterator<Item = (usize, &'a f64)>) -> Self {
+    fn new<'a>(linear: &Linear, rows: impl Iterator<Item = (usize, &'a f64)>) -> Self {
         let width = linear.columns.ncols();
         let rows: Vec<(usize, SVector<f64, COLUMNS>)> =
             rows.map(|(i, t)| (i, waves_at(*t) / linear.sigma[i])).collect();
         let mut out =
             Self { normal: SMatrix::zeros(), cross: DMatrix::zeros(COLUMNS, width), gradient: SVector::zeros() };
-        debug_assert!(rows.len() <= s.points.len());
         let scaled =
             DMatrix::from_fn(rows.len(), width, |n, k| linear.columns[(rows[n].0, k)] / linear.sigma[rows[n].0]);
         let own = DMatrix::from_fn(rows.len(), COLUMNS, |n, k| rows[n].1[k]);
