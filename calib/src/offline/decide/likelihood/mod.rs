@@ -109,22 +109,26 @@ fn explains(stretches: &[Stretch], used: &[bool]) -> bool {
 /// taken about the estimate, since a rig that seems right may still be wrong where nothing shows it.
 pub(in crate::offline) fn fit(hypothesis: &Hypothesis, stretches: &[Stretch], rig: &RigError) -> Option<Fitted> {
     let free = fit_rig(hypothesis, stretches, rig)?;
+    let least_squares = || free.about(free.fitted.clone(), free.fitted.phi.clone());
     if rig.modes.is_empty() {
-        return Some(free.about(free.fitted.clone(), free.fitted.phi.clone()));
+        return Some(least_squares());
     }
     let start = Hypothesis { shapes: free.fitted.shapes.clone(), ..hypothesis.clone() };
     let held = |phi: &[f64]| fit_rig(&start, stretches, &rig.held(phi)).map(|f| f.fitted);
-    // Smooth errors of the edges look like errors of the rig, so that the rig is estimated with the waves.
-    let seen = &free.fitted.phi + free.step.rows(free.fitted.parameters, rig.modes.len());
-    let (Some(put_right), Some(given)) = (held(seen.as_slice()), held(rig.given())) else {
-        return Some(free.about(free.fitted.clone(), free.fitted.phi.clone()));
-    };
+    let Some(given) = held(rig.given()) else { return Some(least_squares()) };
     // Weights of both, whose sum is one.
     let odds = rig.log_odds_given();
     let by_odds = |log: f64| -(1.0 + log.exp()).ln();
     let (a, b) = (free.fitted.log_evidence + by_odds(odds), given.log_evidence + by_odds(-odds));
     let log_evidence = a.max(b) + (1.0 + (-(a - b).abs()).exp()).ln();
-    let (estimate, phi) = if a >= b { (put_right, seen) } else { (given, DVector::from_column_slice(rig.given())) };
+    let (estimate, phi) = if a < b {
+        (given, DVector::from_column_slice(rig.given()))
+    } else {
+        // Smooth errors of the edges look like errors of the rig, so that the rig is estimated with the waves.
+        let seen = &free.fitted.phi + free.step.rows(free.fitted.parameters, rig.modes.len());
+        let Some(put_right) = held(seen.as_slice()) else { return Some(least_squares()) };
+        (put_right, seen)
+    };
     Some(Fitted { log_evidence, ..free.about(estimate, phi) })
 }
 
