@@ -4,7 +4,7 @@ use crate::offline::bar::found::BarFound;
 use crate::offline::bar::torus::Torus;
 use crate::offline::correspondence::rig_error::RigError;
 use crate::offline::decide::likelihood::{Fitted, Hypothesis, Shape, Stretch, fit};
-use crate::offline::decide::models::{Model, UNEVEN, Weighed, prior, stretch, unrelated_px};
+use crate::offline::decide::models::{Model, UNEVEN, Weighed, each_alone, prior, stretch, unrelated_px};
 use crate::offline::rim::model::{Options, Outline, RimModel};
 use crate::offline::rim::planar::{Analysis, analyse};
 
@@ -77,6 +77,8 @@ impl FourOutlines {
                 }
             }
         }
+        let ellipses = [&found.outer[0], &found.inner[0], &found.outer[1], &found.inner[1]].map(|c| &c.ellipse);
+        models.extend(each_alone(&stretches, &ellipses, options.rim, rig));
         Some(Self { found, stretches, outer, models })
     }
 

@@ -4,8 +4,11 @@ use crate::offline::bar::torus::Torus;
 use crate::offline::contour::Contour;
 use crate::offline::correspondence::rig_error::RigError;
 use crate::offline::decide::likelihood::{Fitted, Hypothesis, Shape, Stretch, fit};
-use crate::offline::rim::model::{Outline, Rim, RimChoice};
+use crate::offline::rim::circle::signed_axis;
+use crate::offline::rim::cone::{camera_centre, ray};
+use crate::offline::rim::model::{Ellipse2, Outline, Projection, Rim, RimChoice};
 use crate::offline::rim::planar::Analysis;
+use nalgebra::Vector2;
 
 /// A model of some contours.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -115,7 +118,51 @@ pub(in crate::offline) fn plane_models(
     if let Some((start, _)) = a.between {
         weigh(Model::Opposite, Shape::Circle(start), None);
     }
+    let ellipses = [&contours[0].ellipse, &contours[1].ellipse];
+    out.extend(each_alone(&stretches, &ellipses, choice, rig));
     out
+}
+
+/// Contours that have nothing to do with each other, each as an ellipse of its own image.
+///
+/// [`Hypothesis::unrelated_px`] starts from a rim, and says nothing where contours are so far from one that it leads nowhere. An ellipse of
+/// one image always fits, so that whatever is held against it has to fit the edges as well. Its size and place in space
+/// cannot be seen, and cost as much as their prior is wide.
+pub(in crate::offline) fn each_alone(
+    stretches: &[Stretch],
+    ellipses: &[&Ellipse2],
+    choice: RimChoice,
+    rig: &RigError,
+) -> Option<Weighed> {
+    let believed = rig.held(rig.given());
+    let mut all: Option<Fitted> = None;
+    for (s, e) in stretches.iter().zip(ellipses) {
+        let shapes = vec![Shape::Ellipse(facing(e, believed.p.get(s.view)?)?, UNEVEN)];
+        let own = [Stretch { shape: 0, ..s.clone() }];
+        let fitted = fit(&Hypothesis { shapes, unrelated_px: None }, &own, &believed)?;
+        all = Some(match all {
+            None => fitted,
+            Some(f) => Fitted { log_evidence: f.log_evidence + fitted.log_evidence, ..f },
+        });
+    }
+    let fitted = all?;
+    let log = fitted.log_evidence + prior(Model::Unrelated, choice).ln();
+    Some(Weighed { model: Model::Unrelated, fitted, log })
+}
+
+/// The rim parallel to a camera's image, a metre before it, that looks like an ellipse there.
+fn facing(e: &Ellipse2, p: &Projection) -> Option<Rim> {
+    let back = p.fixed_view::<3, 3>(0, 0).into_owned().try_inverse()?;
+    let (sin, cos) = e.theta.sin_cos();
+    let ahead = back * e.centre.push(1.0);
+    // Of unit length along the ray; turned to the front by `ray`.
+    let reach = ray(p, e.centre.x, e.centre.y)?.dot(&ahead).recip();
+    let (major, minor) = (Vector2::new(cos, sin) * e.a, Vector2::new(-sin, cos) * e.b);
+    let (u, v) = (back * major.push(0.0) * reach, back * minor.push(0.0) * reach);
+    let normal = (-u.cross(&v)).try_normalize(0.0)?;
+    let axis_a = signed_axis(u.try_normalize(0.0)?);
+    let centre = camera_centre(p)? + ahead * reach;
+    Some(Rim { centre, normal, a: u.norm(), b: v.norm(), axis_a, axis_b: normal.cross(&axis_a) })
 }
 
 /// A bar of which two contours would be the outer outlines, and nothing else is seen.
@@ -135,4 +182,81 @@ pub(in crate::offline) fn probabilities(logs: &[f64]) -> Vec<f64> {
     let each: Vec<f64> = logs.iter().map(|l| (l - most).exp()).collect();
     let sum: f64 = each.iter().sum();
     each.into_iter().map(|e| e / sum).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::offline::conic::{ellipse_of, orient};
+    use crate::offline::rim::cone::project;
+    use crate::offline::rim::model::EdgePoint;
+    use crate::offline::rim::synthetic::{rig, rim_point, rim_points, rim_tilted};
+    use graspd_rt::geom::{Camera, Distortion, Rig};
+    use nalgebra::{Matrix3, Vector3};
+
+    #[test]
+    fn a_rim_parallel_to_the_image_looks_like_the_ellipse_it_was_made_for() {
+        let e = Ellipse2 { centre: Vector2::new(700.0, 420.0), a: 90.0, b: 55.0, theta: 0.7 };
+        for p in rig(0.5, 1200.0, 1.5) {
+            let rim = facing(&e, &p).unwrap();
+            for k in 0..12 {
+                let uv = project(&p, &rim_point(&rim, f64::from(k) * 0.5)) - e.centre;
+                let (sin, cos) = e.theta.sin_cos();
+                let (x, y) = ((uv.x * cos + uv.y * sin) / e.a, (uv.y * cos - uv.x * sin) / e.b);
+                assert!((x.hypot(y) - 1.0).abs() < 1e-9, "{x} {y}");
+            }
+        }
+    }
+
+    /// Evidence of two contours as one rim against each as an ellipse of its own image; the right one is higher over the epipolar lines by
+    /// a factor, about its middle.
+    fn odds(higher: f64) -> f64 {
+        let camera = Camera {
+            fx: 1200.0,
+            fy: 1200.0,
+            cx: 640.0,
+            cy: 512.0,
+            width: 1280,
+            height: 1024,
+            distortion: Distortion::default(),
+        };
+        let mut right_from_left = graspd_rt::geom::Pose::identity();
+        right_from_left.translation.vector.x = -0.3;
+        let rig = RigError::none(&Rig { left: camera, right: camera, right_from_left });
+        let rim = rim_tilted(Vector3::new(0.1, 0.02, 1.2), 0.5, 1.0, 0.08, 0.08);
+        let views = [0, 1].map(|k| {
+            let middle = project(&rig.p[k], &rim.centre);
+            let stretched = |uv: Vector2<f64>| {
+                let up = if k == 1 { higher } else { 1.0 };
+                Vector2::new(uv.x, middle.y + (uv.y - middle.y) * up)
+            };
+            rim_points(&rig.p[k], &rim, 120).into_iter().map(stretched).collect::<Vec<_>>()
+        });
+        let stretches = [0, 1].map(|view| Stretch {
+            view,
+            points: views[view].iter().map(|uv| EdgePoint { uv: *uv, sigma: 0.1, outline: Outline::Outer }).collect(),
+            place: (0..120).map(|k| f64::from(k) * std::f64::consts::TAU / 120.0).collect(),
+            shape: 0,
+        });
+        let ellipses = views.each_ref().map(|v| ellipse_through(v));
+        let alone = each_alone(&stretches, &[&ellipses[0], &ellipses[1]], RimChoice::Auto, &rig).unwrap();
+        let shapes = vec![Shape::Ellipse(rim, UNEVEN)];
+        let one = fit(&Hypothesis { shapes, unrelated_px: None }, &stretches, &rig);
+        one.map_or(f64::NEG_INFINITY, |f| f.log_evidence) + prior(Model::Ellipse, RimChoice::Auto).ln() - alone.log
+    }
+
+    /// The ellipse through points on one.
+    fn ellipse_through(points: &[Vector2<f64>]) -> Ellipse2 {
+        let edges: Vec<_> =
+            points.iter().map(|uv| EdgePoint { uv: *uv, sigma: 0.1, outline: Outline::Outer }).collect();
+        let conic: Matrix3<f64> = crate::offline::conic::fit_direct(&edges).unwrap();
+        ellipse_of(&orient(&conic)).unwrap()
+    }
+
+    #[test]
+    fn one_rim_is_held_against_an_ellipse_in_each_image_on_both_sides() {
+        let (same, other) = (odds(1.0), odds(1.1));
+        assert!(same > -MISNAMED.ln(), "one rim: {same}");
+        assert!(other < MISNAMED.ln(), "no rim has both: {other}");
+    }
 }
