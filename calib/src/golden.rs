@@ -287,7 +287,7 @@ fn grasps(out: &mut Map<String, Value>, a: &Analysis, case: &Case, marks: &[Flat
     }
 }
 
-/// The gripper's pose and the predicted marks in space and in both pictures.
+/// The gripper's pose and the predicted marks in space and in both images.
 fn set_point(pose: &Isometry3<f64>, marks: &[FlatMark], p: &[Projection; 2]) -> Map<String, Value> {
     let world: Vec<Vector3<f64>> = marks.iter().map(|m| (pose * Point3::from(m.position)).coords).collect();
     let image = |p: &Projection| -> Vec<[f64; 2]> { world.iter().map(|x| project(p, x)).map(|u| [u.x, u.y]).collect() };

@@ -1,10 +1,10 @@
 //! `graspd plan --mesh` without the command line: a part with a CAD model, where it stands, and what to do with it; every failure in words.
 
 use crate::files::{
-    ContentHash, FileError, GripperFile, MeshRecord, Pick, PickRecord, PicksFile, PictureRecord, PoseFile, PoseRecord,
+    ContentHash, FileError, GripperFile, ImageRecord, MeshRecord, Pick, PickRecord, PicksFile, PoseFile, PoseRecord,
     RigFile, ViewPair,
 };
-use crate::offline::edges::picture::Picture;
+use crate::offline::edges::grey_image::GreyImage;
 use crate::offline::polyhedral::filter::Judged;
 use crate::offline::polyhedral::plan::{MeshOptions, MeshPlan, MeshPlanError, Placed, Survey, survey};
 use crate::offline::polyhedral::pose::{Picked, fit};
@@ -37,8 +37,8 @@ pub struct MeshRequest {
     pub rig: PathBuf,
     /// Gripper file.
     pub gripper: PathBuf,
-    /// Pictures for the overlay, left and right.
-    pub pictures: Option<[PathBuf; 2]>,
+    /// Images for the overlay, left and right.
+    pub images: Option<[PathBuf; 2]>,
     /// Air between each claw and the part, metres.
     pub clearance: Option<f64>,
     /// Smallest contact of each claw, square millimetres.
@@ -65,7 +65,7 @@ pub struct MeshRequest {
     pub handle: Option<usize>,
     /// Where to write the plan.
     pub out: Option<PathBuf>,
-    /// Where to write the picture.
+    /// Where to write the image.
     pub overlay: Option<PathBuf>,
     /// Where to write the one-page report.
     pub report: Option<PathBuf>,
@@ -239,19 +239,19 @@ fn work(r: &MeshRequest) -> Result<Outcome, Failure> {
     let arm = arm(r, options.present.as_ref(), &gripper)?;
     let m = load(&r.mesh, unit_m).map_err(file)?;
     let placed = place(r, &m, &rig)?;
-    let pictures = match &r.pictures {
+    let images = match &r.images {
         None => None,
-        Some([l, s]) => Some([Picture::load(l).map_err(file)?, Picture::load(s).map_err(file)?]),
+        Some([l, s]) => Some([GreyImage::load(l).map_err(file)?, GreyImage::load(s).map_err(file)?]),
     };
-    if let Some([l, s]) = &pictures {
-        for (picture, camera, side) in [(l, &rig.rig.left, "left"), (s, &rig.rig.right, "right")] {
-            let (pw, ph) = (picture.width(), picture.height());
+    if let Some([l, s]) = &images {
+        for (image, camera, side) in [(l, &rig.rig.left, "left"), (s, &rig.rig.right, "right")] {
+            let (pw, ph) = (image.width(), image.height());
             if (pw, ph) != (camera.width as usize, camera.height as usize) {
                 return Err((
                     Class::Input,
-                    "picture-size",
+                    "image-size",
                     format!(
-                        "the {side} picture is {pw} x {ph}, the rig file says {} x {}: give the pictures of this rig",
+                        "the {side} image is {pw} x {ph}, the rig file says {} x {}: give the images of this rig",
                         camera.width, camera.height
                     ),
                 ));
@@ -279,7 +279,7 @@ fn work(r: &MeshRequest) -> Result<Outcome, Failure> {
             return Ok(Outcome { class: Class::Refused, text, json });
         }
     };
-    finish(r, plan, &found, &m, &placed, pictures.as_ref(), &rig, &gripper, handles)
+    finish(r, plan, &found, &m, &placed, images.as_ref(), &rig, &gripper, handles)
 }
 
 #[allow(clippy::too_many_arguments)]
@@ -289,25 +289,25 @@ fn finish(
     found: &Survey<'_>,
     m: &MeshFile,
     placed: &Placed,
-    pictures: Option<&[Picture; 2]>,
+    images: Option<&[GreyImage; 2]>,
     rig: &RigFile,
     gripper: &GripperFile,
     handles: Vec<Value>,
 ) -> Result<Outcome, Failure> {
-    if let Some([l, s]) = pictures {
-        let record = |p: &Picture| PictureRecord {
+    if let Some([l, s]) = images {
+        let record = |p: &GreyImage| ImageRecord {
             hash: p.hash().to_string(),
             width: p.width() as u32,
             height: p.height() as u32,
         };
-        plan.file.pictures = Some(ViewPair { left: record(l), right: record(s) });
+        plan.file.images = Some(ViewPair { left: record(l), right: record(s) });
         plan.text = plan.file.to_toml();
     }
     if let Some(path) = &r.out {
         plan.file.save(path).map_err(file)?;
     }
     if r.overlay.is_some() || r.report.is_some() {
-        let drawn = overlay::draw(&plan, found, &m.mesh, placed, pictures.map(|[l, s]| [l, s]), rig, gripper);
+        let drawn = overlay::draw(&plan, found, &m.mesh, placed, images.map(|[l, s]| [l, s]), rig, gripper);
         let write = |path: &Path, bytes: Option<&[u8]>| {
             let refuse = |reason: String| file(FileError::Write { path: path.display().to_string(), reason });
             let bytes = bytes.ok_or_else(|| refuse("the drawing is too large".to_owned()))?;

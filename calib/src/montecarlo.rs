@@ -157,7 +157,7 @@ fn scene(cell: &Cell, random: &mut Random) -> Option<Scene> {
     Some(Scene { rim, p, points, exact })
 }
 
-/// Pixels at equal steps of arc length in the picture, over a part of the rim.
+/// Pixels at equal steps of arc length in the image, over a part of the rim.
 fn equal_steps(p: &Projection, rim: &Rim, n: usize, from: f64, part: f64) -> Vec<Vector2<f64>> {
     const FINE: usize = 1000;
     let mut length = Vec::with_capacity(FINE + 1);

@@ -5,7 +5,7 @@ use crate::offline::contour::select::Selection;
 use crate::offline::decide::propose::Proposal;
 use crate::offline::drawing::overlay;
 use crate::offline::drawing::report;
-use crate::offline::edges::picture::Picture;
+use crate::offline::edges::grey_image::GreyImage;
 use crate::offline::handle::grasp::Approach;
 use crate::offline::plan::{Plan, PlanError, PlanOptions, Prepared, model_name};
 use crate::offline::rim::model::RimChoice;
@@ -20,9 +20,9 @@ const MOST_PROPOSALS: usize = 12;
 /// What the command line says.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Request {
-    /// Left picture.
+    /// Left image.
     pub left: PathBuf,
-    /// Right picture.
+    /// Right image.
     pub right: PathBuf,
     /// Rig file.
     pub rig: PathBuf,
@@ -56,7 +56,7 @@ pub struct Request {
     pub max_turn: Option<f64>,
     /// Where to write the plan.
     pub out: Option<PathBuf>,
-    /// Where to write the picture.
+    /// Where to write the image.
     pub overlay: Option<PathBuf>,
     /// Where to write the report.
     pub report: Option<PathBuf>,
@@ -71,7 +71,7 @@ pub enum Class {
     Refused,
     /// An option makes no sense (exit code 2).
     Usage,
-    /// A file, picture or selection is wrong (exit code 3).
+    /// A file, image or selection is wrong (exit code 3).
     Input,
 }
 
@@ -176,7 +176,7 @@ fn options(r: &Request) -> Result<PlanOptions, Failure> {
 fn work(r: &Request) -> Result<Outcome, Failure> {
     let options = options(r)?;
     if !r.auto && (r.select_left.is_none() || r.select_right.is_none()) {
-        return Err(usage("select the contour in both pictures with --select-left U,V and --select-right U,V, or let --auto propose some".to_owned()));
+        return Err(usage("select the contour in both images with --select-left U,V and --select-right U,V, or let --auto propose some".to_owned()));
     }
     if r.pick == Some(0) {
         return Err(usage("--pick counts from 1".to_owned()));
@@ -185,16 +185,16 @@ fn work(r: &Request) -> Result<Outcome, Failure> {
     let (left, right) = (select(&r.select_left)?, select(&r.select_right)?);
     let rig = RigFile::load(&r.rig).map_err(file)?;
     let gripper = GripperFile::load(&r.gripper).map_err(file)?;
-    let pictures = [Picture::load(&r.left).map_err(file)?, Picture::load(&r.right).map_err(file)?];
-    let pictures = [&pictures[0], &pictures[1]];
-    if pictures[0] == pictures[1] {
+    let images = [GreyImage::load(&r.left).map_err(file)?, GreyImage::load(&r.right).map_err(file)?];
+    let images = [&images[0], &images[1]];
+    if images[0] == images[1] {
         return Err((
             Class::Input,
-            "same-picture",
-            format!("{} and {} are the same picture: give one of each camera", r.left.display(), r.right.display()),
+            "same-image",
+            format!("{} and {} are the same image: give one of each camera", r.left.display(), r.right.display()),
         ));
     }
-    let views = Prepared::with_prior(pictures, &rig, &options.prior(&rig)).map_err(|e| failed(&e))?;
+    let views = Prepared::with_prior(images, &rig, &options.prior(&rig)).map_err(|e| failed(&e))?;
     let done = match (left, right) {
         (Some(l), Some(s)) if !r.auto => views.plan([&l, &s], &gripper, &options).map_err(|e| failed(&e))?,
         _ => {
@@ -211,7 +211,7 @@ fn work(r: &Request) -> Result<Outcome, Failure> {
             }
             let Some(pick) = r.pick else {
                 if let Some(path) = &r.overlay {
-                    write_bytes(path, overlay::draw_proposals(&found, pictures, &rig))?;
+                    write_bytes(path, overlay::draw_proposals(&found, images, &rig))?;
                 }
                 return Ok(list(&found));
             };
@@ -225,7 +225,7 @@ fn work(r: &Request) -> Result<Outcome, Failure> {
         done.file.save(path).map_err(file)?;
     }
     let drawn =
-        if r.overlay.is_some() || r.report.is_some() { overlay::draw(&done, pictures, &rig, &gripper) } else { None };
+        if r.overlay.is_some() || r.report.is_some() { overlay::draw(&done, images, &rig, &gripper) } else { None };
     if let Some(path) = &r.overlay {
         write_bytes(path, drawn.clone())?;
     }

@@ -146,7 +146,7 @@ fn absurd_selections_pass_less_than_once_in_a_thousand() {
         }
     }
     println!("{passed} of {total} passed, by kind {kinds:?}");
-    // Swapped views of a rim near the middle of a symmetrical rig are pictures of another, equally possible rim: no test of the points
+    // Swapped views of a rim near the middle of a symmetrical rig are images of another, equally possible rim: no test of the points
     // can see it, and refusing both orders would refuse the right one as well. Measured: 34 of 1,250;
     // the epipolar geometry predicts it for rims within a few pixels of the middle. They are counted by themselves.
     assert!(kinds[5] * 8 * 20 <= total, "swapped: {} of {}", kinds[5], total / 8);

@@ -210,7 +210,7 @@ fn the_path_tells_where_it_loses_marks() {
     for (n, fraction) in fewest_on_the_way(&scene, &[away, pregrasp, grasp], 20) {
         assert!(n < LEAST_MARKS && fraction < 0.1, "{n} {fraction}");
     }
-    // A detour out of the picture between two good poses.
+    // A detour out of the image between two good poses.
     let out = Pose::translation(3.0, 0.0, 0.0) * near;
     for (n, fraction) in fewest_on_the_way(&scene, &[near, out, near], 20) {
         assert!(n == 0 && (0.1..0.9).contains(&fraction), "{n} {fraction}");

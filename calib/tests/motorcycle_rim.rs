@@ -3,7 +3,7 @@
 
 use graspd_calib::files::{GripperFile, RigFile};
 use graspd_calib::offline::contour::select::Selection;
-use graspd_calib::offline::edges::picture::Picture;
+use graspd_calib::offline::edges::grey_image::GreyImage;
 use graspd_calib::offline::plan::{Plan, PlanOptions, plan};
 use graspd_calib::offline::rim::model::RimChoice;
 use graspd_rt::geom::{Pixel, Vec3};
@@ -14,7 +14,7 @@ fn example(name: &str) -> PathBuf {
 }
 
 struct Example {
-    pictures: [Picture; 2],
+    images: [GreyImage; 2],
     rig: RigFile,
     gripper: GripperFile,
     front: serde_json::Value,
@@ -27,7 +27,7 @@ fn traced(name: &str) -> serde_json::Value {
 
 fn load() -> Example {
     Example {
-        pictures: ["left.png", "right.png"].map(|f| Picture::load(&example(f)).unwrap()),
+        images: ["left.png", "right.png"].map(|f| GreyImage::load(&example(f)).unwrap()),
         rig: RigFile::load(&example("rig.toml")).unwrap(),
         gripper: GripperFile::load(&example("gripper.toml")).unwrap(),
         front: traced("front_rim.json"),
@@ -74,7 +74,7 @@ impl Example {
         let one = |(a, b)| {
             let selections = [click(a), click(b)];
             plan(
-                [&self.pictures[0], &self.pictures[1]],
+                [&self.images[0], &self.images[1]],
                 [&selections[0], &selections[1]],
                 &self.rig,
                 &self.gripper,

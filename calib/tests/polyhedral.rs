@@ -242,7 +242,7 @@ fn the_report_is_one_page_that_tells_all() {
     let picked = MeshRequest { picks: picks(0.5, 2), ..f.request(&mesh) };
     let (html, o) = page("a.html", picked.clone());
     assert!(html == page("b.html", picked).0, "the same input gave another page");
-    // Nothing is fetched, the picture is in it, both views' residuals and both ellipses are drawn.
+    // Nothing is fetched, the image is in it, both views' residuals and both ellipses are drawn.
     assert!(!html.contains("http") && !html.contains("<script") && html.contains("data:image/png;base64,"));
     assert_eq!(html.matches("<svg").count(), 4);
     assert!(html.contains(o.json["set_point"].as_str().unwrap()));

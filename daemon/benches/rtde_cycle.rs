@@ -94,7 +94,7 @@ fn link(cycles: u64) -> f64 {
     let mut config = UrConfig::new("127.0.0.1", Model::Ur5e);
     config.port_offset = port.wrapping_sub(30004);
     let mut link = UrLink::connect(&config).expect("a session");
-    let (mut before, mut done, mut beat) = (cpu_ns(), 0, 0);
+    let (mut before, mut done, mut cycle) = (cpu_ns(), 0, 0);
     while done < cycles {
         link.wait(now_ns() + 10 * CYCLE_NS);
         let poll = link.poll(now_ns());
@@ -104,8 +104,8 @@ fn link(cycles: u64) -> f64 {
         if poll.packages == 0 {
             continue;
         }
-        beat += 1;
-        let command = ArmCommand { mode: ArmMode::Velocity, rates: [0.1; 6], beat, outputs: 0 };
+        cycle += 1;
+        let command = ArmCommand { mode: ArmMode::Velocity, rates: [0.1; 6], heartbeat: cycle, outputs: 0 };
         link.send(&command).expect("sent");
         done += 1;
         if done == 1 {

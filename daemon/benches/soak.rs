@@ -1,6 +1,6 @@
 //! The real client half against the mock controller for as long as you like: `cargo bench -p graspd --bench soak -- 600 [robot] [ur5]`.
 //!
-//! The daemon's command thread (its cycle, its UR link, its beat) drives a wrist gently to and fro over RTDE against
+//! The daemon's command thread (its cycle, its UR link, its cycle) drives a wrist gently to and fro over RTDE against
 //! `graspd-mock-ur` in a process of its own. Printed: gaps by the controller's clock, each blamed on whom it belongs to (steps that the
 //! host stole from the mock, packages that the mock left out because we did not read, packages that we lost); the round trip from a
 //! command to its echo as bars; memory and descriptors of both processes over time. Ends with code 1 when a gap is ours or something grows.
@@ -106,7 +106,7 @@ fn bars(title: &str, values: &mut [u64], width_us: u64) {
 fn main() {
     let args: Vec<String> = std::env::args().collect();
     let seconds: f64 = args.iter().filter_map(|a| a.parse().ok()).next().unwrap_or(10.0);
-    let beat = if args.iter().any(|a| a == "robot") { "robot" } else { "timer" };
+    let clock = if args.iter().any(|a| a == "robot") { "robot" } else { "timer" };
     let model = args.iter().find(|a| a.starts_with("ur")).map_or("ur5e", String::as_str);
     let folder = std::env::temp_dir().join(format!("graspd-soak-{}", std::process::id()));
     Scenario::from_seed(1, &Options::default()).unwrap().save(&folder.join("world")).unwrap();
@@ -116,7 +116,7 @@ fn main() {
         .unwrap();
     let text = format!(
         "[files]\nrig = \"world/rig.toml\"\ngripper = \"world/gripper.toml\"\n[arm]\nmodel = \"{model}\"\nport_offset = {offset}\n\
-         [loop]\nbest_effort = true\nbeat = \"{beat}\"\n"
+         [loop]\nbest_effort = true\nclock = \"{clock}\"\n"
     );
     std::fs::write(folder.join("graspd.toml"), text).unwrap();
     let config = Config::load(&folder.join("graspd.toml")).unwrap();
@@ -164,7 +164,7 @@ fn soak(config: &Config, seconds: f64, mock: u32, record: &Path) -> i32 {
             enter("command", &ThreadSettings { priority: 80, core: None }, &mut heard);
             heard.refused.iter().for_each(|r| println!("not real-time: {r}"));
             let mut worker = CommandWorker::new(cycle, &shared);
-            if config.raw.beat.beat == "robot" {
+            if config.raw.cycle.clock == "robot" {
                 worker.run_with_robot(config.period_ns());
             } else {
                 worker.run(config.period_ns(), 0);
@@ -220,7 +220,7 @@ fn soak(config: &Config, seconds: f64, mock: u32, record: &Path) -> i32 {
         })
         .sum();
     let ours = stats.missing.saturating_sub(stolen + left_out);
-    println!("{seconds:.0} s at {:.0} Hz, beat by {}", 1.0 / period_s, config.raw.beat.beat);
+    println!("{seconds:.0} s at {:.0} Hz, cycle by {}", 1.0 / period_s, config.raw.cycle.clock);
     println!(
         "states received {}, commands sent {}, dropped {}, link fault {fault:?}",
         stats.received, stats.sent, stats.dropped
@@ -229,7 +229,7 @@ fn soak(config: &Config, seconds: f64, mock: u32, record: &Path) -> i32 {
         "gaps by the controller's clock: {} packages; {stolen} are steps that the host stole from the mock, {left_out} the mock left out, {ours} are ours",
         stats.missing
     );
-    println!("beats of ours that the host stole: {skipped}");
+    println!("cycles of ours that the host stole: {skipped}");
     bars("round trip, command to echo", &mut trips, 250);
     bars("wake-up, late against the grid", &mut wakes, 50);
     println!("\n   time s   client kB  fds     mock kB  fds");

@@ -9,7 +9,7 @@ pub enum Exit {
     NotConverged,
     /// 2: the command line is wrong.
     Usage,
-    /// 3: a file, a picture, a selection or the configuration is wrong.
+    /// 3: a file, an image, a selection or the configuration is wrong.
     Input,
     /// 4: a link could not be made or was lost: robot, shared memory, another process.
     Link,

@@ -16,7 +16,7 @@ pub fn ur_config(config: &Config) -> UrConfig {
     let ranges = config.model.joints();
     UrConfig {
         port_offset: raw.arm.port_offset,
-        beat_hz: raw.beat.rate_hz,
+        cycle_hz: raw.cycle.rate_hz,
         motion: if raw.arm.motion == "position" { Motion::Position } else { Motion::Velocity },
         // The script refuses what exceeds these, so they carry the guard's own limits with room for rounding, never above the arm's.
         speed_limits: ranges.map(|r| (raw.limits.joint_speed_rad_s * 1.02).min(r.speed)),

@@ -53,12 +53,12 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
         // However this scope is left, by a panic as well: its threads end, or it would wait for them for ever.
         let _end = EndOfThreads(&shared);
         let spawn = |name: &str| std::thread::Builder::new().name(name.to_owned());
-        let vision_settings = thread_settings(config.raw.beat.vision_priority, config.raw.beat.vision_core);
-        let command_settings = thread_settings(config.raw.beat.command_priority, config.raw.beat.command_core);
+        let vision_settings = thread_settings(config.raw.cycle.vision_priority, config.raw.cycle.vision_core);
+        let command_settings = thread_settings(config.raw.cycle.command_priority, config.raw.cycle.command_core);
         let poll_ns = (config.raw.vision.poll_us * 1000.0) as u64;
-        let spin_ns = (config.raw.beat.spin_us * 1000.0) as u64;
+        let spin_ns = (config.raw.cycle.spin_us * 1000.0) as u64;
 
-        // The command thread waits for the host's verdict: with it the cycle knows whether missed beats are a fault or the host.
+        // The command thread waits for the host's verdict: with it the cycle knows whether missed cycles are a fault or the host.
         let (cycle_in, cycle_out) = channel::<CommandCycle>();
         let said = host_in.clone();
         let (shared_ref, node_ref) = (&shared, &node);
@@ -70,7 +70,7 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
                 let Ok(cycle) = cycle_out.recv() else { return };
                 shared_ref.guarded("command", || {
                     let mut worker = CommandWorker::new(cycle, shared_ref);
-                    if config.raw.beat.beat == "robot" {
+                    if config.raw.cycle.clock == "robot" {
                         worker.run_with_robot(config.period_ns());
                     } else {
                         worker.run(config.period_ns(), spin_ns);
@@ -136,7 +136,7 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
             }
         }
         report.refused(&host.refused);
-        if config.raw.beat.require_realtime && !host.complete() {
+        if config.raw.cycle.require_realtime && !host.complete() {
             return Err(Failure::link(format!(
                 "loop.require_realtime is true and the host refused: {}",
                 host.refused.join("; ")
@@ -199,10 +199,10 @@ const END_NS: u64 = 3_000_000_000;
 const SETTLED_NS: u64 = 1_000_000_000;
 
 /// Starts the stop thread, which is not joined: it outlives everything else, because it is what ends a process that hangs.
-/// Its priority lies just below the command thread's: it must run while pictures are tracked, and does next to nothing.
+/// Its priority lies just below the command thread's: it must run while images are tracked, and does next to nothing.
 fn start_stop_thread(config: &Config, door: &mut Door, live: &Arc<Live>) -> Result<(), Failure> {
     let Some(listener) = door.listener() else { return Ok(()) };
-    let priority = config.raw.beat.command_priority.saturating_sub(1).max(config.raw.beat.vision_priority);
+    let priority = config.raw.cycle.command_priority.saturating_sub(1).max(config.raw.cycle.vision_priority);
     let after_ns = ramp_limit(config).as_nanos() as u64 + END_NS;
     let end = End { after_ns, settled_ns: SETTLED_NS, code: Exit::Link.code() };
     let live = Arc::clone(live);

@@ -69,7 +69,7 @@ impl Plan {
 }
 
 #[test]
-fn a_missing_picture_names_the_file() {
+fn a_missing_image_names_the_file() {
     let dir = folder("missing");
     let mut p = Plan::good(&dir);
     p.left = dir.join("nowhere.png").display().to_string();
@@ -77,17 +77,17 @@ fn a_missing_picture_names_the_file() {
 }
 
 #[test]
-fn something_that_is_no_picture_is_named() {
-    let dir = folder("notpicture");
+fn something_that_is_no_image_is_named() {
+    let dir = folder("notimage");
     let mut p = Plan::good(&dir);
     let file = dir.join("left.png");
-    std::fs::write(&file, b"this is no picture").unwrap();
+    std::fs::write(&file, b"this is no image").unwrap();
     p.left = file.display().to_string();
     p.refused(3, &["left.png"]);
 }
 
 #[test]
-fn a_picture_of_the_wrong_size_says_both_sizes() {
+fn an_image_of_the_wrong_size_says_both_sizes() {
     let dir = folder("size");
     let mut p = Plan::good(&dir);
     let file = dir.join("small.png");

@@ -89,7 +89,7 @@ fn limits_are_refused_at_load_by_the_files_own_keys() {
     f.refused(&with("joint_speed_rad_s = 1.15"), &["turns a joint by", "8.6 degrees"]);
     f.refused(&with("joint_speed_rad_s = 1.0\ntcp_speed_m_s = 0.5"), &["moves the gripper by", "50.0 mm"]);
     let said = f.good(&with("joint_accel_rad_s2 = 2.0"));
-    // 125 beats of the ramp and 2 of the filter, of 2 ms each.
+    // 125 cycles of the ramp and 2 of the filter, of 2 ms each.
     assert!(said.contains("254 ms") && said.contains("degrees a joint"), "{said}");
 }
 

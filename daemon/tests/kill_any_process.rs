@@ -23,14 +23,14 @@ impl Instants {
     }
 }
 
-/// The last episode of motion, which must be over: when it began to rest, and the last beat before that, ms apart.
+/// The last episode of motion, which must be over: when it began to rest, and the last heartbeat before that, ms apart.
 fn time_to_rest(mock: &Process) -> f64 {
     let seen = summary(mock);
     let last = seen["episodes"].as_array().unwrap().last().unwrap().clone();
     assert!(last["peak_rate"].as_f64().unwrap() > 0.005, "it was moving: {last}");
-    let (rest, beat) = (last["rest_ns"].as_u64().unwrap(), last["last_beat_ns"].as_u64().unwrap());
+    let (rest, heartbeat) = (last["rest_ns"].as_u64().unwrap(), last["last_heartbeat_ns"].as_u64().unwrap());
     assert!(rest > 0, "the arm is at rest: {last}");
-    rest.saturating_sub(beat) as f64 * 1e-6
+    rest.saturating_sub(heartbeat) as f64 * 1e-6
 }
 
 fn episodes(mock: &Process) -> u64 {
@@ -67,8 +67,8 @@ fn any_process_may_be_killed_at_any_moment_of_the_motion() {
         daemon.kill();
         std::thread::sleep(Duration::from_millis(700));
         let stop_ms = time_to_rest(&mock);
-        println!("round {round}: daemon killed after {at:?}: at rest {stop_ms:.1} ms after its last beat");
-        // 50 ms watchdog, 125 ms ramp from full speed, and what a stalled host adds to the mock's own beat.
+        println!("round {round}: daemon killed after {at:?}: at rest {stop_ms:.1} ms after its last heartbeat");
+        // 50 ms watchdog, 125 ms ramp from full speed, and what a stalled host adds to the mock's own heartbeat.
         assert!(stop_ms < 50.0 + 125.0 + 125.0, "{stop_ms} ms");
         assert!(mock.alive() && scene.alive());
         // A restart is idle and moves nothing by itself.
@@ -92,7 +92,7 @@ fn any_process_may_be_killed_at_any_moment_of_the_motion() {
         assert!(daemon.alive() && mock.alive());
         scene = world.scene();
         std::thread::sleep(Duration::from_millis(500));
-        assert_ne!(world.state().0, "servoing", "pictures that come back start nothing");
+        assert_ne!(world.state().0, "servoing", "images that come back start nothing");
         if world.state().0 == "fault" {
             world.clear();
         }

@@ -16,7 +16,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 use wire::{Entry, Wire};
 
-/// Without a beat for this long the arm must be slowing down, s.
+/// Without a heartbeat for this long the arm must be slowing down, s.
 const REACTION_S: f64 = 0.050;
 /// Slower than this is rest, rad/s.
 const REST: f64 = 1e-3;
@@ -28,22 +28,22 @@ const SETTLE_S: f64 = 0.070;
 /// How one stop went, by the wire record.
 #[derive(Clone, Copy, Debug)]
 struct Stop {
-    /// Fastest joint's target speed at the last beat, rad/s.
+    /// Fastest joint's target speed at the last heartbeat, rad/s.
     speed: f64,
-    /// From the last beat to the first step of the ramp, s.
+    /// From the last heartbeat to the first step of the ramp, s.
     reaction_s: f64,
     /// From there to rest, s.
     ramp_s: f64,
 }
 
-/// Judges what follows the last beat of `entries`; in words why this was no stop out of motion.
+/// Judges what follows the last heartbeat of `entries`; in words why this was no stop out of motion.
 fn judge(entries: &[Entry]) -> Result<Stop, String> {
     let mut last = (None, 0);
     for (i, e) in entries.iter().enumerate() {
-        if let Entry::Beat { beat, .. } = e
-            && last.0 != Some(*beat)
+        if let Entry::Heartbeat { heartbeat, .. } = e
+            && last.0 != Some(*heartbeat)
         {
-            last = (Some(*beat), i);
+            last = (Some(*heartbeat), i);
         }
     }
     let steps = |part: &[Entry]| -> Vec<(f64, f64, f64)> {
@@ -55,15 +55,16 @@ fn judge(entries: &[Entry]) -> Result<Stop, String> {
             .collect()
     };
     let (before, after) = entries.split_at(last.1);
-    // The step that takes the last beat is the first one after it.
-    let beat = steps(before).last().copied().ok_or("no step before the last beat")?;
+    // The step that takes the last heartbeat is the first one after it.
+    let heartbeat = steps(before).last().copied().ok_or("no step before the last heartbeat")?;
     let after = steps(after);
-    let speed = after.first().ok_or("no step after the last beat")?.1;
+    let speed = after.first().ok_or("no step after the last heartbeat")?.1;
     if speed < 0.02 {
         return Err(format!("the arm stood still or crept: {speed:.4} rad/s"));
     }
     let rest = after.iter().position(|s| s.1 < REST && s.2 < REST);
-    let rest = rest.ok_or_else(|| format!("NOT AT REST within {:.3} s", after.last().map_or(0.0, |s| s.0) - beat.0))?;
+    let rest =
+        rest.ok_or_else(|| format!("NOT AT REST within {:.3} s", after.last().map_or(0.0, |s| s.0) - heartbeat.0))?;
     // A count of the encoder in one step looks like 3 mrad/s: the last of them settle.
     if let Some(again) = after[rest..].iter().find(|s| s.1 >= REST || s.2 >= 20.0 * REST) {
         return Err(format!("MOVED AGAIN: {again:?}"));
@@ -71,14 +72,14 @@ fn judge(entries: &[Entry]) -> Result<Stop, String> {
     // Back from rest along the slope: the ramp begins where the speed was last held.
     let begin = (1..=rest).rev().find(|&k| after[k].1 > REST && after[k - 1].1 < after[k].1 + 0.3 * RAMP * 0.002);
     let begin = begin.unwrap_or(0);
-    let reaction_s = after[begin].0 - beat.0;
+    let reaction_s = after[begin].0 - heartbeat.0;
     if reaction_s < 0.010 {
         return Err(format!("it was being stopped already: the ramp began after {:.0} ms", reaction_s * 1e3));
     }
     Ok(Stop { speed, reaction_s, ramp_s: after[rest].0 - after[begin].0 })
 }
 
-/// Reads on until the controller's clock is well past the last beat: a stalled host stalls that clock as well.
+/// Reads on until the controller's clock is well past the last heartbeat: a stalled host stalls that clock as well.
 fn read_past_the_stop(wire: &mut Wire) -> Vec<Entry> {
     let (mut entries, start) = (wire.read(), Instant::now());
     loop {
@@ -86,8 +87,8 @@ fn read_past_the_stop(wire: &mut Wire) -> Vec<Entry> {
             Entry::Step { clock_s, .. } => Some(*clock_s),
             _ => None,
         };
-        let last_beat = entries.iter().rposition(|e| matches!(e, Entry::Beat { .. })).unwrap_or(0);
-        let after: Vec<f64> = entries.iter().skip(last_beat).filter_map(clock).collect();
+        let last_heartbeat = entries.iter().rposition(|e| matches!(e, Entry::Heartbeat { .. })).unwrap_or(0);
+        let after: Vec<f64> = entries.iter().skip(last_heartbeat).filter_map(clock).collect();
         let passed = after.last().zip(after.first()).map_or(0.0, |(b, a)| b - a);
         if passed > 0.6 || start.elapsed() > Duration::from_secs(20) {
             return entries;
@@ -149,10 +150,10 @@ impl Tally {
                 println!("{signal} {name}: min {:.1}  median {:.1}  max {:.1}", v[0], v[v.len() / 2], v[v.len() - 1]);
             };
             println!("{signal}: {} stops out of motion, all in bound", stops.len());
-            column("speed at the last beat, mrad/s", &|s| s.speed * 1e3);
-            column("last beat to ramp, ms", &|s| s.reaction_s * 1e3);
+            column("speed at the last heartbeat, mrad/s", &|s| s.speed * 1e3);
+            column("last heartbeat to ramp, ms", &|s| s.reaction_s * 1e3);
             column("ramp to rest, ms", &|s| s.ramp_s * 1e3);
-            column("last beat to rest, ms", &|s| (s.reaction_s + s.ramp_s) * 1e3);
+            column("last heartbeat to rest, ms", &|s| (s.reaction_s + s.ramp_s) * 1e3);
         }
         println!("named after SIGCONT: {:?}", self.reasons);
         println!("instants passed over: {:?}", self.passed_over);

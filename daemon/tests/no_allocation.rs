@@ -1,4 +1,4 @@
-//! The whole daemon in this process, under an allocator that counts: from the first servoing beat to the last, through every fault that
+//! The whole daemon in this process, under an allocator that counts: from the first servoing cycle to the last, through every fault that
 //! the outside can cause, the command thread and the vision thread neither take nor give back heap memory.
 //!
 //! The faults that only the inside can cause are driven, and counted in the same way, by `rt/tests/closed_loop`.

@@ -69,9 +69,9 @@ fn a_python_driver_feeds_the_daemon() {
     };
     let world = World::new(13);
     for eye in ["left", "right"] {
-        let picture = image::open(world.path(&format!("{eye}.png"))).unwrap().into_luma8();
-        assert_eq!(picture.dimensions(), (1280, 1024));
-        std::fs::write(world.path(&format!("{eye}.raw")), picture.into_raw()).unwrap();
+        let image = image::open(world.path(&format!("{eye}.png"))).unwrap().into_luma8();
+        assert_eq!(image.dimensions(), (1280, 1024));
+        std::fs::write(world.path(&format!("{eye}.raw")), image.into_raw()).unwrap();
     }
     let (mock, daemon) = (world.mock(), world.daemon());
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shm/python/publish_stereo.py");
@@ -89,7 +89,7 @@ fn a_python_driver_feeds_the_daemon() {
         std::thread::sleep(Duration::from_millis(100));
         last = world.state();
     }
-    // The state may come with the very first pictures; that they go on coming takes a few more.
+    // The state may come with the very first images; that they go on coming takes a few more.
     let (_, mut said) = world.verb(&["status"]);
     while said["frames"].as_u64().unwrap_or(0) <= 5 && Instant::now() < until {
         std::thread::sleep(Duration::from_millis(100));

@@ -1,4 +1,4 @@
-//! The UR link and the control script against the mock controller, over loopback TCP: identity, upload, motion, a beat that
+//! The UR link and the control script against the mock controller, over loopback TCP: identity, upload, motion, a cycle that
 //! stops, a protective stop and the way back. Every wait is bounded.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 #![cfg(feature = "demo")]
@@ -55,16 +55,16 @@ impl Drop for Mock {
     }
 }
 
-/// Commands on the robot's own beat until `done`.
+/// Commands on the robot's own cycle until `done`.
 fn drive(link: &mut UrLink, mode: ArmMode, rate: f64, outputs: u32, done: impl Fn(&RobotState) -> bool) -> RobotState {
     let start = Instant::now();
-    let mut beat = link.state().map_or(0, |s| s.echo);
+    let mut cycle = link.state().map_or(0, |s| s.echo);
     while start.elapsed() < LIMIT {
         link.wait(now_ns() + 20_000_000);
         let poll = link.poll(now_ns());
         assert_eq!(poll.fault, None);
-        beat = beat.wrapping_add(1);
-        link.send(&ArmCommand { mode, rates: [0.0, 0.0, 0.0, 0.0, 0.0, rate], beat, outputs }).unwrap();
+        cycle = cycle.wrapping_add(1);
+        link.send(&ArmCommand { mode, rates: [0.0, 0.0, 0.0, 0.0, 0.0, rate], heartbeat: cycle, outputs }).unwrap();
         if let Some(state) = poll.state.filter(&done) {
             return state;
         }
@@ -89,7 +89,7 @@ fn at_rest(s: &RobotState) -> bool {
 }
 
 #[test]
-fn both_motions_drive_the_arm_and_a_lost_beat_stops_it() {
+fn both_motions_drive_the_arm_and_a_lost_heartbeat_stops_it() {
     for motion in [Motion::Velocity, Motion::Position] {
         let mut mock = Mock::start(None);
         mock.config.motion = motion;
@@ -105,7 +105,7 @@ fn both_motions_drive_the_arm_and_a_lost_beat_stops_it() {
         while steps < 50 {
             link.wait(now_ns() + 20_000_000);
             steps += link.poll(now_ns()).packages;
-            let command = ArmCommand { mode: ArmMode::Velocity, rates: [0.3; 6], beat: steps as i32, outputs: 0 };
+            let command = ArmCommand { mode: ArmMode::Velocity, rates: [0.3; 6], heartbeat: steps as i32, outputs: 0 };
             link.send(&command).unwrap();
         }
         assert!((link.state().unwrap().q[5] - q0).abs() < 1e-3);
@@ -117,7 +117,7 @@ fn both_motions_drive_the_arm_and_a_lost_beat_stops_it() {
         let stopped = drive(&mut link, ArmMode::Stop, 0.0, 0x0001_0001, |s| at_rest(s) && s.digital_outputs & 1 == 1);
         assert_eq!(stopped.script_state, script_state::STOPPING);
 
-        // The beat ends in full motion: the arm comes to rest by itself, and the program ends.
+        // The cycle ends in full motion: the arm comes to rest by itself, and the program ends.
         drive(&mut link, ArmMode::Velocity, 0.4, 0x0001_0001, |s| s.qd[5] > 0.2);
         let rest = listen(&mut link, |s| at_rest(s) && s.robot_status_bits & 2 == 0);
         assert!(rest.digital_outputs & 1 == 1);
@@ -125,7 +125,7 @@ fn both_motions_drive_the_arm_and_a_lost_beat_stops_it() {
         for _ in 0..20 {
             link.wait(now_ns() + 20_000_000);
             link.poll(now_ns());
-            link.send(&ArmCommand { mode: ArmMode::Velocity, rates: [0.3; 6], beat: 1, outputs: 0 }).unwrap();
+            link.send(&ArmCommand { mode: ArmMode::Velocity, rates: [0.3; 6], heartbeat: 1, outputs: 0 }).unwrap();
         }
         assert!(at_rest(link.state().unwrap()));
     }

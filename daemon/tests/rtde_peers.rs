@@ -252,7 +252,7 @@ fn refused_fields_and_slow_peers_fail_to_connect_with_the_reason() {
 fn a_peer_that_never_reads_is_a_fault_and_never_blocks() {
     let (config, peer) = Peer::default().serve();
     let mut link = connect(&config);
-    let command = ArmCommand { mode: ArmMode::Velocity, rates: [0.1; 6], beat: 1, outputs: 0 };
+    let command = ArmCommand { mode: ArmMode::Velocity, rates: [0.1; 6], heartbeat: 1, outputs: 0 };
     let mut now = 1_000_000;
     let fault = loop {
         now += 2_000_000;

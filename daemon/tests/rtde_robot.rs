@@ -24,22 +24,22 @@ fn mock(model: &str, power_time_s: f64) -> (Hosted, UrConfig) {
     let setup = Setup { power_time_s, ..Setup::new(Plant::by_name(model).unwrap()) };
     let mock = Hosted::start(setup, None, None).unwrap();
     let mut config = UrConfig::new(mock.address.to_string(), Model::from_name(model).unwrap());
-    config.beat_hz = if config.model.is_e_series() { 500.0 } else { 125.0 };
+    config.cycle_hz = if config.model.is_e_series() { 500.0 } else { 125.0 };
     // A stalled host must not look like a dead client here; the usual patience has tests of its own.
     config.watchdog_ms = 1000.0;
     (mock, config)
 }
 
-/// Commands on the robot's own beat until `done`.
+/// Commands on the controller's own packages until `done`.
 fn drive(link: &mut UrLink, mode: ArmMode, rate: f64, outputs: u32, done: impl Fn(&RobotState) -> bool) -> RobotState {
     let start = Instant::now();
-    let mut beat = link.state().map_or(0, |s| s.echo);
+    let mut cycle = link.state().map_or(0, |s| s.echo);
     while start.elapsed() < LIMIT {
         link.wait(now_ns() + 40_000_000);
         let poll = link.poll(now_ns());
         assert_eq!(poll.fault, None);
-        beat = beat.wrapping_add(1);
-        link.send(&ArmCommand { mode, rates: [0.0, 0.0, 0.0, 0.0, 0.0, rate], beat, outputs }).unwrap();
+        cycle = cycle.wrapping_add(1);
+        link.send(&ArmCommand { mode, rates: [0.0, 0.0, 0.0, 0.0, 0.0, rate], heartbeat: cycle, outputs }).unwrap();
         if let Some(state) = poll.state.filter(&done) {
             return state;
         }
@@ -63,7 +63,7 @@ fn at_rest(s: &RobotState) -> bool {
     s.qd.iter().chain(&s.target_qd).all(|v| v.abs() < 1e-3)
 }
 
-/// Session, script, motion, a beat that ends, rest: at the controller's own rate.
+/// Session, script, motion, a heartbeat that ends, rest: at the controller's own rate.
 fn whole_session(mock: &mut Hosted, config: &UrConfig, version: Version, hz: f64) {
     let identity = read_identity(config).unwrap();
     check_model(&identity, config.model).unwrap();
@@ -91,7 +91,7 @@ fn cb3_runs_at_its_own_rate_in_both_motions() {
         whole_session(&mut mock, &config, Version::V2, 125.0);
     }
     // 40 ms of patience are five of its steps, and the watchdog stands two behind.
-    let usual = UrConfig { beat_hz: 125.0, ..UrConfig::new("localhost", Model::Ur5) };
+    let usual = UrConfig { cycle_hz: 125.0, ..UrConfig::new("localhost", Model::Ur5) };
     let text = render(&usual, 1, 0.008).unwrap();
     assert!(text.contains("PATIENCE_STEPS = 5\n") && text.contains("17.857"), "{text}");
 }
@@ -244,11 +244,11 @@ fn the_controller_is_heard_saying_why_it_stopped_and_its_popups_are_closed() {
     assert!(world.robot.popup.is_none(), "a popup is left on the pendant");
 }
 
-/// Beats until `enough` of them were noted in one go; how many links the worker was told of in them.
-fn beats(shared: &Shared, enough: usize) -> Vec<u32> {
+/// Cycles until `enough` of them were noted in one go; how many links the worker was told of in them.
+fn cycles(shared: &Shared, enough: usize) -> Vec<u32> {
     let (start, mut links) = (Instant::now(), Vec::new());
     while links.len() < enough {
-        assert!(start.elapsed() < LIMIT, "only {} beats", links.len());
+        assert!(start.elapsed() < LIMIT, "only {} cycles", links.len());
         while let Some(note) = shared.records.pop() {
             links.push(note.link);
         }
@@ -258,7 +258,7 @@ fn beats(shared: &Shared, enough: usize) -> Vec<u32> {
 }
 
 #[test]
-fn a_beat_by_the_robot_goes_on_without_it() {
+fn a_cycle_by_the_robot_goes_on_without_it() {
     let (mock, config) = mock("ur5e", 0.05);
     let scenario = Scenario::from_seed(1, &Options::default()).unwrap();
     let cycle = CommandCycle::new(CycleConfig {
@@ -272,17 +272,17 @@ fn a_beat_by_the_robot_goes_on_without_it() {
     let shared = Shared::default();
     std::thread::scope(|scope| {
         scope.spawn(|| CommandWorker::new(cycle, &shared).run_with_robot(2_000_000));
-        assert!(beats(&shared, 50).iter().all(|link| *link == 1), "a timer before there is a robot");
+        assert!(cycles(&shared, 50).iter().all(|link| *link == 1), "a timer before there is a robot");
         let mut link = UrLink::connect(&config).unwrap();
         link.bring_up(&config).unwrap();
         shared.link_ready.put(Box::new(link));
-        assert!(beats(&shared, 600).ends_with(&[2; 400]), "beats with the robot");
+        assert!(cycles(&shared, 600).ends_with(&[2; 400]), "cycles with the robot");
         drop(mock);
         let until = Instant::now() + LIMIT;
-        while !beats(&shared, 50).ends_with(&[1]) {
+        while !cycles(&shared, 50).ends_with(&[1]) {
             assert!(Instant::now() < until, "the lost robot is not noticed");
         }
-        assert!(beats(&shared, 200).ends_with(&[1; 150]), "and a timer after it");
+        assert!(cycles(&shared, 200).ends_with(&[1; 150]), "and a timer after it");
         let dead = shared.link_dead.take().unwrap();
         assert!(dead.fault().is_some() && dead.stats().sent > 300, "{:?}", dead.stats());
         shared.shutdown.store(true, std::sync::atomic::Ordering::Release);

@@ -191,7 +191,9 @@ fn a_second_publisher_stops_the_arm() {
     // here.
     let sent: Vec<_> = (cell.wire.read().into_iter())
         .filter_map(|e| match e {
-            wire::Entry::Beat { beat, mode, rates, .. } => Some((beat, if mode == 1 { rates } else { [0.0; 6] })),
+            wire::Entry::Heartbeat { heartbeat, mode, rates, .. } => {
+                Some((heartbeat, if mode == 1 { rates } else { [0.0; 6] }))
+            }
             _ => None,
         })
         .collect();

@@ -87,7 +87,7 @@ fn main() {
         });
     }
 
-    // The most work a picture can make: noise of full contrast in every window.
+    // The most work an image can make: noise of full contrast in every window.
     let mut busy = Pair { left: pair.left.clone(), right: pair.right.clone(), width: pair.width, height: pair.height };
     for b in busy.left.iter_mut().chain(busy.right.iter_mut()) {
         *b = random.bits() as u8;

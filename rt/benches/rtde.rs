@@ -117,7 +117,7 @@ fn main() {
     });
 
     let writer = CommandWriter::new(1, 99, 10.0);
-    let command = ArmCommand { mode: ArmMode::Velocity, rates: [0.1; 6], beat: 3, outputs: 0 };
+    let command = ArmCommand { mode: ArmMode::Velocity, rates: [0.1; 6], heartbeat: 3, outputs: 0 };
     measure("emit our whole command (4 ints, 13 doubles)", || {
         black_box(writer.write(black_box(&command), None, &mut out).unwrap());
     });

@@ -1,4 +1,4 @@
-//! A borrowed grey picture.
+//! A borrowed grey image.
 
 pub mod convert;
 
@@ -12,7 +12,7 @@ pub struct ImageView<'a> {
 }
 
 impl<'a> ImageView<'a> {
-    /// Borrows a picture; `None` when the buffer is shorter than the last pixel needs, or a size is zero or absurd.
+    /// Borrows an image; `None` when the buffer is shorter than the last pixel needs, or a size is zero or absurd.
     pub fn new(data: &'a [u8], width: usize, height: usize, stride: usize) -> Option<Self> {
         if width == 0 || height == 0 || width > 65_535 || height > 65_535 || stride < width {
             return None;

@@ -1,9 +1,9 @@
-//! The only value that crosses from the off-line to the on-line stage: where the marks have to be in both pictures.
+//! The only value that crosses from the off-line to the on-line stage: where the marks have to be in both images.
 
 use crate::geom::{Pixel, Pose, Vec3};
 use crate::gripper::MAX_MARKS;
 
-/// A gripper pose to be reached, as the paper means it: the predicted pictures of the marks.
+/// A gripper pose to be reached, as the paper means it: the predicted images of the marks.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Goal {
     /// Gripper pose in the rig at the goal. It gives depths and the path; the loop is closed on `marks`.

@@ -339,7 +339,7 @@ fn symmetric_layouts_are_named() {
     assert!(!layout_is_ambiguous(&ring(8, |k, m| if k == 2 {
         m.position *= 0.8
     })));
-    // A shift below what pictures tell apart is no help.
+    // A shift below what images tell apart is no help.
     assert!(layout_is_ambiguous(&ring(8, |k, m| if k == 2 {
         m.position *= 0.99
     })));

@@ -23,7 +23,7 @@ fn joints() -> impl Strategy<Value = Joints> {
     prop::array::uniform6(rate())
 }
 
-/// A wish that lasts for some beats, with a share, a beat's length and whether it is a stop.
+/// A wish that lasts for some cycles, with a share, a cycle's length and whether it is a stop.
 fn wish() -> impl Strategy<Value = (Joints, usize, f64, f64, bool)> {
     let dt = prop_oneof![6 => Just(T), 2 => 0.0..0.006_f64, 1 => prop::num::f64::ANY];
     let share = prop_oneof![4 => Just(1.0), 2 => 0.0..1.0_f64, 1 => prop::num::f64::ANY];
@@ -61,8 +61,8 @@ proptest! {
         let mut q = READY;
         q[near_end] = max[near_end] - 0.15;
         let mut last = [0.0; 6];
-        for (wanted, beats, share, dt, stop) in wishes {
-            for _ in 0..beats {
+        for (wanted, cycles, share, dt, stop) in wishes {
+            for _ in 0..cycles {
                 let jacobian = dh.body_jacobian(&q, &mount);
                 let out = if stop { guard.stop(dt) } else { guard.step(&wanted, &q, &jacobian, share, dt) };
                 let passed = if dt.is_finite() { dt.clamp(0.0, T) } else { 0.0 };
@@ -85,11 +85,11 @@ proptest! {
             }
         }
         // From anything, a stop reaches rest in bound, and stays.
-        let mut beats = 0;
+        let mut cycles = 0;
         while !guard.at_rest() {
             guard.stop(T);
-            beats += 1;
-            prop_assert!(beats as u64 * PERIOD_NS <= limits.ramp_ns(), "still moving after {beats} beats");
+            cycles += 1;
+            prop_assert!(cycles as u64 * PERIOD_NS <= limits.ramp_ns(), "still moving after {cycles} cycles");
         }
         prop_assert_eq!(guard.stop(T).rates, [0.0; 6]);
     }
@@ -118,15 +118,15 @@ proptest! {
         }
     }
 
-    /// On an even beat, between the first steps of stops, the jerk stays within its limit.
+    /// On an even cycle, between the first steps of stops, the jerk stays within its limit.
     #[test]
-    fn jerk_is_bounded_on_an_even_beat(wishes in prop::collection::vec((prop::array::uniform6(-1.0..1.0_f64), 1..80_usize), 1..8)) {
+    fn jerk_is_bounded_on_an_even_cycle(wishes in prop::collection::vec((prop::array::uniform6(-1.0..1.0_f64), 1..80_usize), 1..8)) {
         let limits = Limits::new(&limits(800.0), Model::Ur5e, PERIOD_NS).unwrap();
         let mut guard = Guard::new(limits);
         let jacobian = Dh::nominal(Model::Ur5e).body_jacobian(&READY, &Pose::identity());
         let (mut last, mut change) = ([0.0; 6], [0.0; 6]);
-        for (wanted, beats) in wishes {
-            for _ in 0..beats {
+        for (wanted, cycles) in wishes {
+            for _ in 0..cycles {
                 let out = guard.step(&wanted, &READY, &jacobian, 1.0, T).rates;
                 for i in 0..6 {
                     let new = out[i] - last[i];

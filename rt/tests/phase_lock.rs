@@ -1,4 +1,4 @@
-//! The robot-locked beat on a virtual clock: jitter, drift, lost and held packages, silence, a controller that restarts.
+//! The robot-locked cycle on a virtual clock: jitter, drift, lost and held packages, silence, a controller that restarts.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_rt::rtde::PhaseLock;
@@ -49,9 +49,9 @@ impl Default for Robot {
     }
 }
 
-/// One beat as it came.
+/// One cycle as it came.
 #[derive(Clone, Copy, Debug)]
-struct Beat {
+struct Cycle {
     at: u64,
     /// Its place on the grid.
     place: u64,
@@ -60,14 +60,14 @@ struct Beat {
     phase: f64,
 }
 
-/// Runs a lock against a robot for so many beats of `compute` ns.
-fn run(robot: &Robot, beats: usize, compute: u64, seed: u64) -> (PhaseLock, Vec<Beat>) {
+/// Runs a lock against a robot for so many cycles of `compute` ns.
+fn run(robot: &Robot, cycles: usize, compute: u64, seed: u64) -> (PhaseLock, Vec<Cycle>) {
     let mut random = Random(seed);
     let period = PERIOD as f64 * (1.0 + robot.ppm * 1e-6);
     // Arrivals in order, as TCP delivers them: a held package holds those behind it.
     let mut arrivals = Vec::new();
     let mut held_until = 0u64;
-    for k in 0..2 * beats {
+    for k in 0..2 * cycles {
         let mut step = robot.phase + (k as f64 * period) as u64;
         if step >= robot.restart.0 {
             step += robot.restart.1;
@@ -83,7 +83,7 @@ fn run(robot: &Robot, beats: usize, compute: u64, seed: u64) -> (PhaseLock, Vec<
     }
     let mut lock = PhaseLock::new(PERIOD, START);
     let (mut now, mut read, mut seen) = (START, 0, Vec::new());
-    for _ in 0..beats {
+    for _ in 0..cycles {
         // Sleep, wait, sleep, as the command thread does.
         now = now.max(lock.listen_ns());
         let come = arrivals.get(read).map_or(u64::MAX, |a| a.0.max(now));
@@ -92,9 +92,9 @@ fn run(robot: &Robot, beats: usize, compute: u64, seed: u64) -> (PhaseLock, Vec<
         now = now.max(lock.arrived(now, package));
         let usual = robot.phase as f64 + robot.delay as f64 + 0.5 * robot.jitter;
         let turns = (lock.next_ns() as f64 - usual) / period;
-        let beat =
-            Beat { at: now, place: lock.next_ns(), locked: lock.is_locked(), phase: (turns - turns.round()) * period };
-        seen.push(beat);
+        let cycle =
+            Cycle { at: now, place: lock.next_ns(), locked: lock.is_locked(), phase: (turns - turns.round()) * period };
+        seen.push(cycle);
         // Drain to the newest.
         let from = read;
         while arrivals.get(read).is_some_and(|a| a.0 <= now) {
@@ -107,12 +107,12 @@ fn run(robot: &Robot, beats: usize, compute: u64, seed: u64) -> (PhaseLock, Vec<
     (lock, seen)
 }
 
-/// What holds for every beat of every run, locked or not.
-fn check_bounds(lock: &PhaseLock, beats: &[Beat]) {
+/// What holds for every cycle of every run, locked or not.
+fn check_bounds(lock: &PhaseLock, cycles: &[Cycle]) {
     let tolerance = lock.tolerance_ns();
-    for pair in beats.windows(2) {
+    for pair in cycles.windows(2) {
         let [a, b] = [pair[0], pair[1]];
-        assert!(b.at.abs_diff(b.place) <= tolerance, "a beat left its place: {b:?}");
+        assert!(b.at.abs_diff(b.place) <= tolerance, "a cycle left its place: {b:?}");
         let step = b.place as f64 - a.place as f64;
         // Slew and drift together move the grid by less than 2.2 % of a period.
         assert!((step - PERIOD as f64).abs() <= 0.022 * PERIOD as f64, "the grid jumped by {step} ns");
@@ -123,14 +123,14 @@ fn check_bounds(lock: &PhaseLock, beats: &[Beat]) {
 fn it_locks_within_a_second_and_stays_through_jitter_drift_and_losses() {
     for (seed, ppm) in [100.0, -100.0, 0.0, 30.0].into_iter().enumerate() {
         let robot = Robot { ppm, lost: 0.05, ..Robot::default() };
-        let (lock, beats) = run(&robot, 60_000, 200_000, seed as u64);
-        check_bounds(&lock, &beats);
-        let first = beats.iter().position(|b| b.locked).unwrap();
-        assert!(first < 500, "locked only at beat {first}");
-        for b in &beats[first..] {
+        let (lock, cycles) = run(&robot, 60_000, 200_000, seed as u64);
+        check_bounds(&lock, &cycles);
+        let first = cycles.iter().position(|b| b.locked).unwrap();
+        assert!(first < 500, "locked only at cycle {first}");
+        for b in &cycles[first..] {
             assert!(b.locked, "lost the lock at {ppm} ppm");
         }
-        for b in &beats[1000..] {
+        for b in &cycles[1000..] {
             assert!(b.phase.abs() <= 0.5 * lock.tolerance_ns() as f64, "{ppm} ppm: {b:?}");
         }
         assert!((lock.drift_ppm() - ppm).abs() < 70.0, "learnt {} ppm of {ppm}", lock.drift_ppm());
@@ -141,48 +141,48 @@ fn it_locks_within_a_second_and_stays_through_jitter_drift_and_losses() {
 fn every_phase_at_the_start_is_found() {
     for k in 0..40 {
         let robot = Robot { phase: START + k * PERIOD / 40, ppm: 50.0, ..Robot::default() };
-        let (lock, beats) = run(&robot, 2000, 150_000, k);
-        check_bounds(&lock, &beats);
-        let first = beats.iter().position(|b| b.locked).unwrap();
-        assert!(first < 500, "phase {k}/40: locked at beat {first}");
-        assert!(beats[1000..].iter().all(|b| b.locked && b.phase.abs() < 250_000.0), "phase {k}/40");
+        let (lock, cycles) = run(&robot, 2000, 150_000, k);
+        check_bounds(&lock, &cycles);
+        let first = cycles.iter().position(|b| b.locked).unwrap();
+        assert!(first < 500, "phase {k}/40: locked at cycle {first}");
+        assert!(cycles[1000..].iter().all(|b| b.locked && b.phase.abs() < 250_000.0), "phase {k}/40");
     }
 }
 
 #[test]
 fn held_packages_do_not_pull_it_away() {
     let robot = Robot { ppm: -80.0, held: 0.01, ..Robot::default() };
-    let (lock, beats) = run(&robot, 30_000, 200_000, 3);
-    check_bounds(&lock, &beats);
-    let first = beats.iter().position(|b| b.locked).unwrap();
-    let locked = beats[first..].iter().filter(|b| b.locked).count();
-    assert!(locked * 100 > 98 * (beats.len() - first), "{locked} of {}", beats.len() - first);
+    let (lock, cycles) = run(&robot, 30_000, 200_000, 3);
+    check_bounds(&lock, &cycles);
+    let first = cycles.iter().position(|b| b.locked).unwrap();
+    let locked = cycles[first..].iter().filter(|b| b.locked).count();
+    assert!(locked * 100 > 98 * (cycles.len() - first), "{locked} of {}", cycles.len() - first);
 }
 
 #[test]
 fn silence_leaves_a_timer_and_the_robot_is_found_again() {
     let silence = (START + 4_000_000_000, START + 8_000_000_000);
     let robot = Robot { ppm: 100.0, silence, ..Robot::default() };
-    let (lock, beats) = run(&robot, 8000, 200_000, 9);
-    check_bounds(&lock, &beats);
-    let at = |t: u64| beats.iter().find(|b| b.at > t).unwrap();
+    let (lock, cycles) = run(&robot, 8000, 200_000, 9);
+    check_bounds(&lock, &cycles);
+    let at = |t: u64| cycles.iter().find(|b| b.at > t).unwrap();
     assert!(at(silence.0 - 1_000_000_000).locked);
     let given_up = at(silence.0 + 100_000_000);
-    assert!(!given_up.locked, "25 silent beats end the lock: {given_up:?}");
+    assert!(!given_up.locked, "25 silent cycles end the lock: {given_up:?}");
     // It goes on at the rhythm that it had learnt.
-    let during: Vec<_> = beats.iter().filter(|b| b.at > silence.0 + 100_000_000 && b.at < silence.1).collect();
+    let during: Vec<_> = cycles.iter().filter(|b| b.at > silence.0 + 100_000_000 && b.at < silence.1).collect();
     let mean = (during.last().unwrap().at - during[0].at) as f64 / (during.len() - 1) as f64;
     assert!((mean - PERIOD as f64).abs() < 400.0, "{mean} ns");
-    assert!(at(silence.1 + 1_000_000_000).locked && beats.last().unwrap().locked);
+    assert!(at(silence.1 + 1_000_000_000).locked && cycles.last().unwrap().locked);
 }
 
 #[test]
 fn a_restart_at_another_phase_is_followed_without_a_jump() {
     for shift in [300_000, 1_000_000, 1_700_000] {
         let robot = Robot { restart: (START + 3_000_000_000, shift), ..Robot::default() };
-        let (lock, beats) = run(&robot, 5000, 200_000, shift);
-        check_bounds(&lock, &beats);
-        assert!(beats.last().unwrap().locked, "shift {shift}");
+        let (lock, cycles) = run(&robot, 5000, 200_000, shift);
+        check_bounds(&lock, &cycles);
+        assert!(cycles.last().unwrap().locked, "shift {shift}");
     }
 }
 

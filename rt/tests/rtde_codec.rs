@@ -201,7 +201,7 @@ fn client_and_server_meet_in_both_versions_and_any_pieces() {
 
             // Command to the server.
             let writer = CommandWriter::new(session.input(0).unwrap().0, 4242, 9.0);
-            let command = ArmCommand { mode: ArmMode::Velocity, rates: [0.25; 6], beat: 9, outputs: 0x1_0001 };
+            let command = ArmCommand { mode: ArmMode::Velocity, rates: [0.25; 6], heartbeat: 9, outputs: 0x1_0001 };
             let n = writer.write(&command, None, &mut out).unwrap();
             assert_eq!(n, CommandWriter::PACKAGE);
             server.answer(package(&out[..n]));
@@ -237,7 +237,7 @@ fn what_is_not_a_number_is_sent_as_a_stop() {
     let mut out = [0u8; CommandWriter::PACKAGE];
     let writer = CommandWriter::new(1, 5, 9.0);
     for (rates, targets) in [([f64::NAN; 6], None), ([0.1; 6], Some([f64::INFINITY; 6]))] {
-        let command = ArmCommand { mode: ArmMode::Velocity, rates, beat: 1, outputs: 0 };
+        let command = ArmCommand { mode: ArmMode::Velocity, rates, heartbeat: 1, outputs: 0 };
         writer.write(&command, targets.as_ref(), &mut out).unwrap();
         assert_eq!(out[4..8], 2i32.to_be_bytes());
         let doubles = out[20..].as_chunks::<8>().0;

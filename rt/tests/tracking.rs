@@ -1,4 +1,4 @@
-//! Tracking against rendered truth: bias and honest covariance of marks and pose, and what happens when the picture lies.
+//! Tracking against rendered truth: bias and honest covariance of marks and pose, and what happens when the image lies.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod support;
@@ -371,7 +371,7 @@ fn frames_that_lie_are_refused_by_name_and_counted() {
 }
 
 #[test]
-fn a_frozen_picture_is_seen_although_the_prediction_moves() {
+fn a_frozen_image_is_seen_although_the_prediction_moves() {
     let (mut cycle, truth, mut random) = tracking(12);
     let pair = render(
         cycle.rig(),

@@ -145,9 +145,9 @@ fn other_shapes_in_place_of_marks_are_refused() {
 }
 
 #[test]
-fn a_gripper_that_leaves_the_picture_degrades_before_it_is_lost() {
+fn a_gripper_that_leaves_the_image_degrades_before_it_is_lost() {
     let mut w = World::new(6);
-    // To the left in steps of 12 mm, until it is out of both pictures.
+    // To the left in steps of 12 mm, until it is out of both images.
     let (mut degraded, mut lost) = (None, None);
     for k in 0..140 {
         w.truth.translation.vector.x -= 0.012;

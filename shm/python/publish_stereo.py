@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Publishes stereo pairs to graspd from Python: a camera driver to start from. Needs: pip install iceoryx2==0.10.0 (numpy optional).
 
-The layout, the quality of service and the rules are those of shm/LAYOUT.md. Pictures here are a moving ramp; replace `picture()`.
+The layout, the quality of service and the rules are those of shm/LAYOUT.md. Images here are a moving ramp; replace `image()`.
 """
 
 import argparse
@@ -63,14 +63,14 @@ def default_root() -> str:
     return os.path.join(d, "graspd") if os.path.isdir(d) else f"/tmp/graspd-{os.geteuid()}"
 
 
-def picture(width: int, height: int, k: int, eye: int) -> bytes:
-    """One mono8 picture: a diagonal ramp that moves with k. A real driver copies its camera's buffer here."""
+def image(width: int, height: int, k: int, eye: int) -> bytes:
+    """One mono8 image: a diagonal ramp that moves with k. A real driver copies its camera's buffer here."""
     row = bytes((x + 3 * k + 50 * eye) & 0xFF for x in range(width + height))
     return b"".join(row[y : y + width] for y in range(height))
 
 
 def raw(path, n):
-    """A picture from a file of exactly n bytes."""
+    """An image from a file of exactly n bytes."""
     with open(path, "rb") as f:
         data = f.read()
     if len(data) != n:
@@ -88,7 +88,7 @@ def main() -> int:
     a.add_argument("--rate", type=float, default=60.0, help="pairs per second")
     a.add_argument("--count", type=int, default=0, help="stop after so many pairs; 0 never")
     a.add_argument("--drop-every", type=int, default=0, help="lose every n-th pair on purpose")
-    a.add_argument("--left-raw", help="publish this file of width x height bytes instead of a test picture")
+    a.add_argument("--left-raw", help="publish this file of width x height bytes instead of a test image")
     a.add_argument("--right-raw", help="the same for the right eye")
     a.add_argument("--serial-left", default="left")
     a.add_argument("--serial-right", default="right")
@@ -128,9 +128,9 @@ def main() -> int:
         .create()
     )
     if o.left_raw and o.right_raw:
-        pictures = [[raw(o.left_raw, n), raw(o.right_raw, n)]] * 8
+        images = [[raw(o.left_raw, n), raw(o.right_raw, n)]] * 8
     else:
-        pictures = [[picture(o.width, o.height, k, eye) for eye in (0, 1)] for k in range(8)]
+        images = [[image(o.width, o.height, k, eye) for eye in (0, 1)] for k in range(8)]
     period = 1e9 / o.rate
     start = time.monotonic_ns()
     print('{"ready":true}', flush=True)
@@ -146,7 +146,7 @@ def main() -> int:
         sample = publisher.loan_slice_uninit(2 * n)
         target = sample.payload().as_ptr()
         for eye in (0, 1):
-            ctypes.memmove(target + eye * n, pictures[sequence % 8][eye], n)
+            ctypes.memmove(target + eye * n, images[sequence % 8][eye], n)
         h = sample.user_header().contents
         h.magic, h.layout_version, h.header_size = MAGIC, 1, 192
         h.sequence, h.trigger = sequence, sequence

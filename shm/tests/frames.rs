@@ -22,7 +22,7 @@ fn stamp() -> FrameStamp {
 
 fn send(p: &mut FramePublisher, value: u8) -> u64 {
     let mut loan = p.loan().unwrap();
-    let (l, r) = loan.pictures();
+    let (l, r) = loan.images();
     l.fill(value);
     r.fill(value ^ 0xff);
     loan.send(&stamp()).unwrap()
@@ -208,7 +208,7 @@ fn child_publisher() {
     let mut p = FramePublisher::new(&node, geometry()).unwrap();
     for k in 0..20_000u32 {
         let mut loan = p.loan().unwrap();
-        let (l, _) = loan.pictures();
+        let (l, _) = loan.images();
         l.fill(k as u8);
         loan.send(&stamp()).unwrap();
         std::thread::sleep(Duration::from_millis(2));

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-/// Why a rig, gripper, plan, picture or mesh file is refused.
+/// Why a rig, gripper, plan, image or mesh file is refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum FileError {
     /// The file cannot be opened or read.
@@ -84,7 +84,7 @@ pub(super) fn read_text(path: &Path) -> Result<String, FileError> {
         ));
     }
     let bytes = std::fs::read(path).map_err(|e| refuse(e.to_string(), "check the path and its permissions"))?;
-    String::from_utf8(bytes).map_err(|_| refuse("it is not UTF-8 text".to_owned(), "name a TOML file, not a picture"))
+    String::from_utf8(bytes).map_err(|_| refuse("it is not UTF-8 text".to_owned(), "name a TOML file, not an image"))
 }
 
 /// Writes a text file through a neighbour and a rename, so that a reader never sees half of it.

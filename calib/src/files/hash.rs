@@ -1,4 +1,4 @@
-//! Content hashes: what ties a plan to its rig, its gripper and its pictures.
+//! Content hashes: what ties a plan to its rig, its gripper and its images.
 
 use sha2::{Digest, Sha256};
 use std::fmt;

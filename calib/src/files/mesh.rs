@@ -1,4 +1,4 @@
-//! Where a part with a mesh stands: `pose.toml`, or points of it picked in both pictures, `picks.toml`.
+//! Where a part with a mesh stands: `pose.toml`, or points of it picked in both images, `picks.toml`.
 
 use super::error::{self, FileError, Source};
 use super::pose::PoseRecord;
@@ -67,14 +67,14 @@ impl PoseFile {
     }
 }
 
-/// A point of a mesh and its pixels in both pictures.
+/// A point of a mesh and its pixels in both images.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pick {
     /// The point in the mesh's frame, in the mesh file's unit.
     pub point: Vec3,
-    /// Its pixel in the left picture.
+    /// Its pixel in the left image.
     pub left: Pixel,
-    /// Its pixel in the right picture.
+    /// Its pixel in the right image.
     pub right: Pixel,
 }
 
@@ -94,7 +94,7 @@ impl Pick {
     }
 }
 
-/// Points picked in both pictures.
+/// Points picked in both images.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PicksFile {
     /// The picks, in the order of the file.

@@ -22,8 +22,8 @@ pub use hash::ContentHash;
 pub use mesh::{Pick, PicksFile, PoseFile};
 pub use outputs::keep_apart;
 pub use plan::{
-    CandidateRecord, ConeRecord, EdgeRecord, GoalRecord, GripRecord, MarkRecord, MeshRecord, ModelRecord, ObjectRecord,
-    PathRecord, PickRecord, PictureRecord, PlanFile, SeenCamera, SeenRig, SelectionRecord, SourceRecord, ViewPair,
+    CandidateRecord, ConeRecord, EdgeRecord, GoalRecord, GripRecord, ImageRecord, MarkRecord, MeshRecord, ModelRecord,
+    ObjectRecord, PathRecord, PickRecord, PlanFile, SeenCamera, SeenRig, SelectionRecord, SourceRecord, ViewPair,
 };
 pub use pose::PoseRecord;
 pub use rig::{Quality, RigFile};

@@ -72,10 +72,10 @@ pub struct SourceRecord {
     pub hash: String,
 }
 
-/// A picture that the plan was made from.
+/// An image that the plan was made from.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct PictureRecord {
+pub struct ImageRecord {
     /// SHA-256 of the grey values, row by row, eight bits each.
     pub hash: String,
     /// Width, pixels.
@@ -108,7 +108,7 @@ pub struct EdgeRecord {
     pub sigma_px: f64,
     /// Root mean square distance of the edge points from the ellipse, pixels.
     pub rms_px: f64,
-    /// Ellipse of the undistorted picture: centre u, centre v, semi-axes a >= b (pixels), angle of a (radians).
+    /// Ellipse of the undistorted image: centre u, centre v, semi-axes a >= b (pixels), angle of a (radians).
     pub ellipse: [f64; 5],
 }
 
@@ -132,7 +132,7 @@ pub struct ModelRecord {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ConeRecord {
-    /// Scale-free correspondence score of the two pictures; 0 for one conic.
+    /// Scale-free correspondence score of the two images; 0 for one conic.
     pub delta: f64,
     /// The two gaps between epipolar tangents, pixels.
     pub gap_px: [f64; 2],
@@ -240,9 +240,9 @@ pub struct MeshRecord {
 pub struct PickRecord {
     /// The point in the mesh's frame, metres.
     pub point_m: [f64; 3],
-    /// Its pixel in the left picture.
+    /// Its pixel in the left image.
     pub left_px: [f64; 2],
-    /// Its pixel in the right picture.
+    /// Its pixel in the right image.
     pub right_px: [f64; 2],
 }
 
@@ -338,10 +338,10 @@ impl SeenRig {
 pub struct MarkRecord {
     /// Its place in the gripper file, counted from 0.
     pub index: usize,
-    /// Pixel of its centre in the left picture, lens distortion included; absent when it is not seen.
+    /// Pixel of its centre in the left image, lens distortion included; absent when it is not seen.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub left_px: Option<[f64; 2]>,
-    /// The same in the right picture.
+    /// The same in the right image.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub right_px: Option<[f64; 2]>,
 }
@@ -354,7 +354,7 @@ pub struct GoalRecord {
     pub standoff_m: f64,
     /// Gripper pose in the left camera's frame.
     pub left_from_gripper: PoseRecord,
-    /// The marks' predicted pictures.
+    /// The marks' predicted images.
     pub mark: Vec<MarkRecord>,
 }
 
@@ -402,9 +402,9 @@ pub struct PlanFile {
     /// The straight path from the present pose, when that was given.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub path: Option<PathRecord>,
-    /// The pictures.
+    /// The images.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub pictures: Option<ViewPair<PictureRecord>>,
+    pub images: Option<ViewPair<ImageRecord>>,
     /// The selections.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub selection: Option<ViewPair<SelectionRecord>>,
@@ -615,7 +615,7 @@ impl PlanFile {
         let body = self.canonical();
         let content = ContentHash::of(body.as_bytes());
         format!(
-            "# A plan: where the gripper's marks have to be in both pictures, and how that was found.\n\
+            "# A plan: where the gripper's marks have to be in both images, and how that was found.\n\
              # Lengths in metres in the left camera's frame unless a key says otherwise; every key is described in docs/FILES.md.\n\
              {CONTENT} = \"{content}\"\n{body}"
         )

@@ -22,19 +22,19 @@ pub struct RigFile {
     pub quality: Option<Quality>,
 }
 
-/// How well a calibration fits its pictures.
+/// How well a calibration fits its images.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Quality {
-    /// Root mean square reprojection error of the pictures used, pixels.
+    /// Root mean square reprojection error of the images used, pixels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rms_px: Option<f64>,
-    /// The same on pictures kept aside.
+    /// The same on images kept aside.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub holdout_rms_px: Option<f64>,
-    /// Number of picture pairs used.
+    /// Number of image pairs used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub pictures: Option<u32>,
+    pub images: Option<u32>,
     /// One standard deviation of the relative rotation about each axis, rad.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rotation_rad: Option<f64>,
@@ -239,13 +239,13 @@ fn camera(src: &Source<'_>, key: &str, r: &RawCamera) -> Result<Camera, FileErro
     };
     let k = |leaf: &str| format!("{key}.{leaf}");
     if r.width == 0 || r.width > 65_535 {
-        return Err(src.refuse(&k("width"), r.width, "not a picture's width", "give the width in pixels, 1 to 65535"));
+        return Err(src.refuse(&k("width"), r.width, "not an image's width", "give the width in pixels, 1 to 65535"));
     }
     if r.height == 0 || r.height > 65_535 {
         return Err(src.refuse(
             &k("height"),
             r.height,
-            "not a picture's height",
+            "not an image's height",
             "give the height in pixels, 1 to 65535",
         ));
     }
@@ -264,14 +264,14 @@ fn camera(src: &Source<'_>, key: &str, r: &RawCamera) -> Result<Camera, FileErro
         CameraError::Folds => src.refuse(
             &k("distortion"),
             [d.k1, d.k2, d.p1, d.p2, d.k3],
-            "this lens model folds the picture over itself, so that a pixel has no unique ray",
-            "check the order k1, k2, p1, p2, k3 and the signs, or calibrate with points out to the picture's corners",
+            "this lens model folds the image over itself, so that a pixel has no unique ray",
+            "check the order k1, k2, p1, p2, k3 and the signs, or calibrate with points out to the image's corners",
         ),
         CameraError::NotFinite => {
             src.refuse(key, "a number that is not finite", "not a measurement", "calibrate again")
         }
         CameraError::FocalLength => src.refuse(&k("fx"), [r.fx, r.fy], "not a focal length", "give pixels"),
-        CameraError::ImageSize => src.refuse(&k("width"), [r.width, r.height], "not a picture size", "give pixels"),
+        CameraError::ImageSize => src.refuse(&k("width"), [r.width, r.height], "not an image size", "give pixels"),
     })
 }
 

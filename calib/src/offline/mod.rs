@@ -1,6 +1,6 @@
 //! The off-line stage, one folder per step of the paper, in the order in which a click passes through them:
 //!
-//! 1. [`edges`]: from a picture to sub-pixel edge points, and from the lens to ideal pixels.
+//! 1. [`edges`]: from an image to sub-pixel edge points, and from the lens to ideal pixels.
 //! 2. [`contour`]: from a click to the edge points of one contour.
 //! 3. [`conic`]: from those points to an ellipse with its covariance.
 //! 4. [`correspondence`]: which places of the two views belong together (section 4.2, equation 4), and how far the rig file is off.

@@ -1,8 +1,8 @@
-//! The whole off-line stage as one pure function: two pictures, what was selected in them, a rig and a gripper in; a plan or a reason out.
+//! The whole off-line stage as one pure function: two images, what was selected in them, a rig and a gripper in; a plan or a reason out.
 
 use crate::files::{
-    ConeRecord, EdgeRecord, FileError, GoalRecord, GripperFile, MarkRecord, ModelRecord, ObjectRecord, PathRecord,
-    PictureRecord, PlanFile, PoseRecord, RigFile, SeenRig, SelectionRecord, SourceRecord, ViewPair,
+    ConeRecord, EdgeRecord, FileError, GoalRecord, GripperFile, ImageRecord, MarkRecord, ModelRecord, ObjectRecord,
+    PathRecord, PlanFile, PoseRecord, RigFile, SeenRig, SelectionRecord, SourceRecord, ViewPair,
 };
 use crate::offline::contour::select::{self, Candidate, SelectError, Selection};
 use crate::offline::contour::{Contour, ViewEdges};
@@ -10,8 +10,8 @@ use crate::offline::correspondence::rig_error::{RigError, RigPrior};
 use crate::offline::correspondence::spots::{Votes, spots};
 use crate::offline::decide::pairing::{self, Pair};
 use crate::offline::decide::propose::{Proposal, propose};
+use crate::offline::edges::grey_image::GreyImage;
 use crate::offline::edges::lens::{Lens, projection};
-use crate::offline::edges::picture::Picture;
 use crate::offline::handle::grasp::{self, Approach, Grasp, GraspError, object_frame};
 use crate::offline::handle::setpoint::{RimObstacle, Scene, fewest_on_the_way};
 use crate::offline::rim::model::{self, Reconstruction, RimModel};
@@ -77,16 +77,16 @@ pub enum PlanError {
     /// A file is wrong.
     #[error(transparent)]
     File(#[from] FileError),
-    /// A picture's size is not the camera's.
+    /// An image's size is not the camera's.
     #[error(
-        "the {view} picture is {width}x{height}, but the rig's {view} camera is {rig_width}x{rig_height}: give the picture of that camera, unscaled, or the rig file of this size"
+        "the {view} image is {width}x{height}, but the rig's {view} camera is {rig_width}x{rig_height}: give the image of that camera, unscaled, or the rig file of this size"
     )]
-    PictureSize {
+    ImageSize {
         /// "left" or "right".
         view: &'static str,
-        /// Width of the picture.
+        /// Width of the image.
         width: usize,
-        /// Height of the picture.
+        /// Height of the image.
         height: usize,
         /// Width in the rig file.
         rig_width: u32,
@@ -98,15 +98,15 @@ pub enum PlanError {
     Select(#[from] SelectError),
     /// The views are swapped.
     #[error(
-        "the views are swapped: the contours do not fit one rim as given ({as_given}), but do with left and right exchanged: exchange the two pictures, or the cameras in the rig file"
+        "the views are swapped: the contours do not fit one rim as given ({as_given}), but do with left and right exchanged: exchange the two images, or the cameras in the rig file"
     )]
     Swapped {
         /// Why they do not fit as given.
         as_given: Refusal,
     },
-    /// The pictures are exchanged, by everything that is in them.
+    /// The images are exchanged, by everything that is in them.
     #[error(
-        "the views are swapped: of the distinct spots of the pictures {exchanged} lie where the rig wants them with left and right exchanged, {as_given} as given: exchange the two pictures, or the cameras in the rig file"
+        "the views are swapped: of the distinct spots of the images {exchanged} lie where the rig wants them with left and right exchanged, {as_given} as given: exchange the two images, or the cameras in the rig file"
     )]
     Exchanged {
         /// Spots that speak for the order as given.
@@ -127,7 +127,7 @@ impl PlanError {
     pub fn kind(&self) -> &'static str {
         match self {
             Self::File(_) => "file",
-            Self::PictureSize { .. } => "picture-size",
+            Self::ImageSize { .. } => "image-size",
             Self::Select(_) => "selection",
             Self::Swapped { .. } | Self::Exchanged { .. } => "views-swapped",
             Self::Rim(_) => "rim",
@@ -141,32 +141,32 @@ impl PlanError {
     }
 }
 
-/// Two pictures with everything that a plan takes from them whatever is selected, so that several selections cost its making once.
+/// Two images with everything that a plan takes from them whatever is selected, so that several selections cost its making once.
 #[derive(Debug)]
 pub struct Prepared<'a> {
     pub(super) edges: [ViewEdges<'a>; 2],
     /// The rig as the images have it, and what stays unknown of it.
     pub(super) seen: RigError,
-    pictures: [&'a Picture; 2],
+    images: [&'a GreyImage; 2],
     rig: &'a RigFile,
     votes: Votes,
 }
 
 impl<'a> Prepared<'a> {
     /// The same for a rig of the quality that its file states.
-    pub fn new(pictures: [&'a Picture; 2], rig: &'a RigFile) -> Result<Self, PlanError> {
-        Self::with_prior(pictures, rig, &RigPrior(rig.error()))
+    pub fn new(images: [&'a GreyImage; 2], rig: &'a RigFile) -> Result<Self, PlanError> {
+        Self::with_prior(images, rig, &RigPrior(rig.error()))
     }
 
     /// Checks the images' sizes, holds the images against the rig file, and finds their edges.
-    pub fn with_prior(pictures: [&'a Picture; 2], rig: &'a RigFile, prior: &RigPrior) -> Result<Self, PlanError> {
-        for (view, picture, name) in [(View::Left, pictures[0], "left"), (View::Right, pictures[1], "right")] {
+    pub fn with_prior(images: [&'a GreyImage; 2], rig: &'a RigFile, prior: &RigPrior) -> Result<Self, PlanError> {
+        for (view, image, name) in [(View::Left, images[0], "left"), (View::Right, images[1], "right")] {
             let c = rig.rig.camera(view);
-            if (picture.width(), picture.height()) != (c.width as usize, c.height as usize) {
-                return Err(PlanError::PictureSize {
+            if (image.width(), image.height()) != (c.width as usize, c.height as usize) {
+                return Err(PlanError::ImageSize {
                     view: name,
-                    width: picture.width(),
-                    height: picture.height(),
+                    width: image.width(),
+                    height: image.height(),
                     rig_width: c.width,
                     rig_height: c.height,
                 });
@@ -174,11 +174,11 @@ impl<'a> Prepared<'a> {
         }
         let lenses = View::BOTH.map(|v| Lens::new(rig.rig.camera(v)));
         let p = View::BOTH.map(|v| projection(&rig.rig, v));
-        let noise = pictures[0].noise().max(pictures[1].noise());
-        let found = spots(pictures, [&lenses[0], &lenses[1]], [&p[0], &p[1]], noise);
+        let noise = images[0].noise().max(images[1].noise());
+        let found = spots(images, [&lenses[0], &lenses[1]], [&p[0], &p[1]], noise);
         let seen = RigError::observe(&rig.rig, prior, &found.matches);
-        let edges = View::BOTH.map(|v| ViewEdges::new(pictures[v.index()], seen.rig.camera(v)));
-        Ok(Self { edges, seen, pictures, rig, votes: found.votes })
+        let edges = View::BOTH.map(|v| ViewEdges::new(images[v.index()], seen.rig.camera(v)));
+        Ok(Self { edges, seen, images, rig, votes: found.votes })
     }
 
     /// How the images' spots vote on their order.
@@ -191,7 +191,7 @@ impl<'a> Prepared<'a> {
         &self.seen
     }
 
-    /// Refuses pictures in the wrong order.
+    /// Refuses images in the wrong order.
     fn in_order(&self) -> Result<(), PlanError> {
         let v = self.order();
         if v.are_exchanged() {
@@ -200,7 +200,7 @@ impl<'a> Prepared<'a> {
         Ok(())
     }
 
-    /// Plans a grasp on the contour that was selected in both pictures.
+    /// Plans a grasp on the contour that was selected in both images.
     pub fn plan(
         &self,
         selections: [&Selection; 2],
@@ -257,7 +257,7 @@ impl<'a> Prepared<'a> {
         from_candidates(self, [&left, &right], record, gripper, options)
     }
 
-    /// Why the contours do not fit as given, where pictures too plain to tell their order do fit with selections and cameras exchanged.
+    /// Why the contours do not fit as given, where images too plain to tell their order do fit with selections and cameras exchanged.
     fn crossed(&self, selections: [&Selection; 2], options: &PlanOptions) -> Option<Refusal> {
         if self.order().are_as_given() {
             return None;
@@ -272,15 +272,15 @@ impl<'a> Prepared<'a> {
     }
 }
 
-/// Plans a grasp on the contour that was selected in both pictures.
+/// Plans a grasp on the contour that was selected in both images.
 pub fn plan(
-    pictures: [&Picture; 2],
+    images: [&GreyImage; 2],
     selections: [&Selection; 2],
     rig: &RigFile,
     gripper: &GripperFile,
     options: &PlanOptions,
 ) -> Result<Plan, PlanError> {
-    Prepared::with_prior(pictures, rig, &options.prior(rig))?.plan(selections, gripper, options)
+    Prepared::with_prior(images, rig, &options.prior(rig))?.plan(selections, gripper, options)
 }
 
 /// The rest of the stage, from each view's candidate contours.
@@ -291,9 +291,9 @@ pub(super) fn from_candidates(
     gripper: &GripperFile,
     options: &PlanOptions,
 ) -> Result<Plan, PlanError> {
-    // A rim near the middle can be reconstructed either way round; the rest of the pictures tells.
+    // A rim near the middle can be reconstructed either way round; the rest of the images tells.
     views.in_order()?;
-    let (pictures, rig) = (views.pictures, views.rig);
+    let (images, rig) = (views.images, views.rig);
     let found =
         pairing::pair([&views.edges[0], &views.edges[1]], candidates, &views.seen, &options.rim).map_err(|u| {
             if u.swapped_fits && !views.order().are_as_given() {
@@ -306,7 +306,7 @@ pub(super) fn from_candidates(
     let matches = views.seen.seen;
     let grasp = grasp::choose(&seen, gripper, &reconstruction, &options.approach)?;
     let mut plan = assemble((contours, inner), reconstruction, grasp, (rig, &seen), gripper, options);
-    plan.file.pictures = Some(pair_of(pictures.map(|p| PictureRecord {
+    plan.file.images = Some(pair_of(images.map(|p| ImageRecord {
         hash: p.hash().to_string(),
         width: p.width() as u32,
         height: p.height() as u32,
@@ -377,7 +377,7 @@ fn assemble(
         pregrasp: goal_record(&goals[0], standoffs[0]),
         grasp: goal_record(&goals[1], standoffs[1]),
         path,
-        pictures: None,
+        images: None,
         selection: None,
         edges: Some(pair_of([0, 1].map(|k| edge_record(&contours[k])))),
         seen_rig: None,

@@ -14,7 +14,7 @@ pub struct MockLimits {
     pub acceleration: f64,
     /// Time constant of the drives, s.
     pub lag_s: f64,
-    /// A beat that stands still for this long ramps the arm down, s.
+    /// A heartbeat that stops for this long ramps the arm down, s.
     pub patience_s: f64,
     /// Controller step, s.
     pub step_s: f64,
@@ -48,7 +48,7 @@ pub struct MockArm {
     command: ArmCommand,
     script: (i32, i32),
     still_s: f64,
-    last_beat: i32,
+    last_heartbeat: i32,
     safety: u32,
     mode: i32,
     outputs: u64,
@@ -71,7 +71,7 @@ impl MockArm {
             command: ArmCommand::default(),
             script: (script_state::IDLE, 0),
             still_s: 0.0,
-            last_beat: 0,
+            last_heartbeat: 0,
             safety: 1,
             mode: 7,
             outputs: 0,
@@ -117,7 +117,7 @@ impl MockArm {
             // The tool's outputs stand where a controller has them, behind the configurable ones.
             digital_outputs: self.outputs & 0xff | (self.outputs & 0x300) << 8,
             tool: None,
-            echo: self.last_beat,
+            echo: self.last_heartbeat,
             script_state: self.script.0,
             script_fault: self.script.1,
             script_token: self.token,
@@ -132,11 +132,11 @@ impl MockArm {
     fn script_step(&mut self) -> Joints {
         let zero = [0.0; 6];
         let c = self.command;
-        if c.beat == self.last_beat {
+        if c.heartbeat == self.last_heartbeat {
             self.still_s += self.limits.step_s;
         } else {
             self.still_s = 0.0;
-            self.last_beat = c.beat;
+            self.last_heartbeat = c.heartbeat;
         }
         let refused = c.rates.iter().zip(self.limits.speed).any(|(r, max)| !(r.abs() <= max));
         self.script = if self.still_s >= self.limits.patience_s
@@ -243,9 +243,9 @@ mod tests {
         MockArm::new(graspd_rt::arm::READY, MockLimits::of(Model::Ur5e))
     }
 
-    fn drive(arm: &mut MockArm, now: &mut u64, mode: ArmMode, rate: f64, beats: i32) -> RobotState {
-        for beat in 1..=beats {
-            arm.send(&ArmCommand { mode, rates: [rate; 6], beat: beat + *now as i32, outputs: 0 }).unwrap();
+    fn drive(arm: &mut MockArm, now: &mut u64, mode: ArmMode, rate: f64, heartbeats: i32) -> RobotState {
+        for heartbeat in 1..=heartbeats {
+            arm.send(&ArmCommand { mode, rates: [rate; 6], heartbeat: heartbeat + *now as i32, outputs: 0 }).unwrap();
             *now += MS2;
             arm.poll(*now);
         }
@@ -269,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn a_beat_that_stands_still_stops_it_until_idle() {
+    fn a_heartbeat_that_stops_stops_it_until_idle() {
         let (mut arm, mut now) = (arm(), MS2);
         drive(&mut arm, &mut now, ArmMode::Velocity, 0.5, 100);
         for _ in 0..100 {

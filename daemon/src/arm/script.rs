@@ -32,10 +32,10 @@ pub fn render(config: &UrConfig, token: i32, step_s: f64) -> Result<String, ArmE
     }
     positive("acceleration", config.acceleration, 40.0)?;
     positive("stop acceleration", config.stop_acceleration, 40.0)?;
-    positive("loop.rate_hz", config.beat_hz, 1000.0)?;
+    positive("loop.rate_hz", config.cycle_hz, 1000.0)?;
     positive("arm.watchdog_ms", config.watchdog_ms, 1000.0)?;
-    // The script's own patience ends before the controller's watchdog, and never within two and a half beats of a slow loop.
-    let patience_s = (0.8e-3 * config.watchdog_ms).max(2.5 / config.beat_hz);
+    // The script's own patience ends before the controller's watchdog, and never within two and a half cycles of a slow loop.
+    let patience_s = (0.8e-3 * config.watchdog_ms).max(2.5 / config.cycle_hz);
     let watchdog_s = (config.watchdog_ms * 1e-3).max(patience_s + 2.0 * step_s);
     let limits: Vec<String> = config.speed_limits.iter().map(|v| format!("{v:.6}")).collect();
     let filled = [
@@ -110,7 +110,7 @@ mod tests {
 
     #[test]
     fn a_slow_loop_gets_more_patience_and_the_watchdog_stays_behind_it() {
-        let config = UrConfig { beat_hz: 50.0, ..UrConfig::new("localhost", Model::Ur5) };
+        let config = UrConfig { cycle_hz: 50.0, ..UrConfig::new("localhost", Model::Ur5) };
         let text = render(&config, 1, 0.008).unwrap();
         assert!(text.contains("PATIENCE_STEPS = 7"));
         assert!(text.contains("15.152"), "watchdog at patience and two steps");

@@ -18,7 +18,7 @@ use super::ur_config::{ArmError, Motion, Port, UrConfig, fresh_token};
 /// A send buffer that stays full for this long is a fault.
 const BLOCKED_NS: u64 = 20_000_000;
 
-/// Reads of one poll. A healthy link needs two; a flood is read on at the next beat.
+/// Reads of one poll. A healthy link needs two; a flood is read on at the next cycle.
 const MAX_READS: usize = 16;
 
 /// `robot_mode` of an arm that can move.
@@ -45,7 +45,7 @@ pub struct UrLink {
     blocked_since_ns: Option<u64>,
     /// Joint targets of position mode, and when they were last moved on.
     targets: Option<(Joints, u64)>,
-    /// Longest time that one beat may move them on, ns.
+    /// Longest time that one cycle may move them on, ns.
     most_ns: u64,
     motion: Motion,
     last: Option<RobotState>,
@@ -92,7 +92,7 @@ impl UrLink {
             unsent_to: 0,
             blocked_since_ns: None,
             targets: None,
-            most_ns: (2e9 / config.beat_hz.max(1.0)).max(10e6) as u64,
+            most_ns: (2e9 / config.cycle_hz.max(1.0)).max(10e6) as u64,
             motion: config.motion,
             last: None,
             now_ns: 0,
@@ -305,7 +305,7 @@ impl UrLink {
         }
         let start = self.last.map(|s| s.target_q)?;
         let (mut q, then) = self.targets.unwrap_or((start, self.now_ns));
-        // A late beat moves the target on by two beats at most: the arm waits for us, it does not leap.
+        // A late cycle moves the target on by two cycles at most: the arm waits for us, it does not leap.
         let dt = self.now_ns.saturating_sub(then).min(self.most_ns) as f64 * 1e-9;
         for (q, rate) in q.iter_mut().zip(command.rates) {
             *q += rate * dt;

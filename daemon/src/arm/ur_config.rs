@@ -42,8 +42,8 @@ pub struct UrConfig {
     pub model: Model,
     /// State packages a second; the controller's maximum when `None`.
     pub frequency_hz: Option<f64>,
-    /// Beat of the command thread, Hz: the script's patience follows from it.
-    pub beat_hz: f64,
+    /// Cycle of the command thread, Hz: the script's patience follows from it.
+    pub cycle_hz: f64,
     /// How motion is asked for.
     pub motion: Motion,
     /// Speed that the script refuses to exceed, each joint, rad/s.
@@ -59,14 +59,14 @@ pub struct UrConfig {
 }
 
 impl UrConfig {
-    /// Usual values for a model at an address: 500 Hz beat, the model's speeds, 50 ms watchdog.
+    /// Usual values for a model at an address: 500 Hz cycle, the model's speeds, 50 ms watchdog.
     pub fn new(address: impl Into<String>, model: Model) -> UrConfig {
         UrConfig {
             address: address.into(),
             port_offset: 0,
             model,
             frequency_hz: None,
-            beat_hz: 500.0,
+            cycle_hz: 500.0,
             motion: Motion::Velocity,
             speed_limits: model.joints().map(|r| r.speed),
             acceleration: 10.0,

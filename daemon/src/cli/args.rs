@@ -21,7 +21,7 @@ pub struct Cli {
 pub enum Command {
     /// Run the whole chain against a simulated robot and simulated cameras, as separate processes
     Demo(DemoArgs),
-    /// Off line: from one click in each picture, or a CAD mesh, to a set-point (plan.toml) and an overlay
+    /// Off line: from one click in each image, or a CAD mesh, to a set-point (plan.toml) and an overlay
     Plan(Box<PlanArgs>),
     /// On line: the real-time daemon; frames in, robot commands out
     Run(RunArgs),
@@ -143,10 +143,10 @@ pub struct StudyArgs {
 /// `graspd plan`.
 #[derive(Debug, Args)]
 pub struct PlanArgs {
-    /// Left picture (PNG, JPEG, PGM)
+    /// Left image (PNG, JPEG, PGM)
     #[arg(long, value_name = "L.png", required_unless_present = "mesh", requires = "right")]
     pub left: Option<PathBuf>,
-    /// Right picture
+    /// Right image
     #[arg(long, value_name = "R.png", required_unless_present = "mesh", requires = "left")]
     pub right: Option<PathBuf>,
     /// Rig calibration
@@ -155,10 +155,10 @@ pub struct PlanArgs {
     /// Gripper model
     #[arg(long, value_name = "gripper.toml")]
     pub gripper: PathBuf,
-    /// Selection in the left picture: one click "U,V", several points "U,V;U,V;...", or a box "U0,V0,U1,V1"
+    /// Selection in the left image: one click "U,V", several points "U,V;U,V;...", or a box "U0,V0,U1,V1"
     #[arg(long, value_name = "U,V", allow_hyphen_values = true)]
     pub select_left: Option<String>,
-    /// Selection in the right picture
+    /// Selection in the right image
     #[arg(long, value_name = "U,V", allow_hyphen_values = true)]
     pub select_right: Option<String>,
     /// Propose ellipses instead of taking a selection, list them and draw them numbered
@@ -215,7 +215,7 @@ pub struct PlanArgs {
 /// `graspd demo`.
 #[derive(Debug, Clone, Args)]
 pub struct DemoArgs {
-    /// No progress, no pictures: run, print the result, end
+    /// No progress, no images: run, print the result, end
     #[arg(long)]
     pub headless: bool,
     /// Which world: valve, start, rig and noise are drawn from this number
@@ -224,7 +224,7 @@ pub struct DemoArgs {
     /// One JSON object on standard output
     #[arg(long)]
     pub json: bool,
-    /// Where pictures, plan and recordings go
+    /// Where images, plan and recordings go
     #[arg(long, value_name = "DIR", default_value = "graspd-demo")]
     pub out: PathBuf,
     /// Views that close the loop; best is the paper's: the one view that shows the marks best

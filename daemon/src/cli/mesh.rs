@@ -19,7 +19,7 @@ pub struct MeshArgs {
     /// Where the part stands: a file with left_from_mesh
     #[arg(long, value_name = "pose.toml", requires = "mesh")]
     pub mesh_pose: Option<PathBuf>,
-    /// Where the part stands: points of it picked in both pictures
+    /// Where the part stands: points of it picked in both images
     #[arg(long, value_name = "picks.toml", requires = "mesh")]
     pub points: Option<PathBuf>,
     /// A picked point: its place on the mesh (in the mesh's unit) and its pixels left and right; repeat it, three at least
@@ -54,7 +54,7 @@ pub struct MeshArgs {
 /// Runs it.
 pub(super) fn plan(args: &PlanArgs) -> Outcome {
     let part = &args.part;
-    let pictures = match (&args.left, &args.right) {
+    let images = match (&args.left, &args.right) {
         (Some(l), Some(r)) => Some([l.clone(), r.clone()]),
         _ => None,
     };
@@ -67,7 +67,7 @@ pub(super) fn plan(args: &PlanArgs) -> Outcome {
         pick_limit_px: Some(part.pick_limit),
         rig: args.rig.clone(),
         gripper: args.gripper.clone(),
-        pictures,
+        images,
         clearance: Some(part.clearance),
         contact_mm2: Some(part.contact_mm2),
         pregrasp: args.pregrasp,

@@ -1,4 +1,4 @@
-//! `graspd plan`: the off-line stage, on a contour in two pictures or on a CAD mesh.
+//! `graspd plan`: the off-line stage, on a contour in two images or on a CAD mesh.
 
 use super::args::PlanArgs;
 use crate::exit::{Exit, Failure};

@@ -41,9 +41,9 @@ pub fn cycle_config(c: &Config, dh: Dh, realtime: bool) -> CycleConfig {
         ..LawSettings::default()
     };
     let frame_period_ns = (1e9 / raw.vision.frame_rate_hz) as u64;
-    // A host without real-time scheduling misses beats as a matter of course: they are counted and said, and only a stall stops
+    // A host without real-time scheduling misses cycles as a matter of course: they are counted and said, and only a stall stops
     // the arm (the robot's own watchdog stands behind that).
-    let strict = realtime && !raw.beat.best_effort;
+    let strict = realtime && !raw.cycle.best_effort;
     let mut watch = if strict { WatchSettings::default() } else { WatchSettings::best_effort() };
     // One package that a slow controller leaves out must not be a stale state.
     if !c.model.is_e_series() {
@@ -91,7 +91,7 @@ pub(super) fn outputs_word(set: &[u8], clear: &[u8]) -> u32 {
     (bits(set) | bits(clear)) << 16 | bits(set)
 }
 
-/// One picture shows half of what two do.
+/// One image shows half of what two do.
 fn min_points(both_views: usize, views: &str) -> u8 {
     let needed = if views == "stereo" { both_views } else { both_views.div_ceil(2) };
     u8::try_from(needed).unwrap_or(u8::MAX)

@@ -19,7 +19,7 @@ pub struct RawConfig {
     pub arm: RawArm,
     /// The two real-time threads.
     #[serde(default, rename = "loop")]
-    pub beat: RawLoop,
+    pub cycle: RawLoop,
     /// Frames and tracking.
     #[serde(default)]
     pub vision: RawVision,
@@ -76,7 +76,7 @@ pub struct RawArm {
     /// How motion is asked for: "velocity" (speedj) or "position" (servoj).
     #[serde(default = "d_motion")]
     pub motion: String,
-    /// The robot stops by itself when it sees no beat for this long, ms; 20 to 200.
+    /// The robot stops by itself when it sees no cycle for this long, ms; 20 to 200.
     #[serde(default = "d_watchdog")]
     pub watchdog_ms: f64,
 }
@@ -85,10 +85,10 @@ pub struct RawArm {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RawLoop {
-    /// Beat of the command thread, Hz; 50 to 1000, or 0 for the controller's own: 500, CB3 125.
+    /// Rate of the command thread, Hz; 50 to 1000, or 0 for the controller's own: 500, CB3 125.
     pub rate_hz: f64,
-    /// What the beat follows: "timer", or "robot" (phase-locked to the controller's packages).
-    pub beat: String,
+    /// What starts a cycle: "timer", or "robot" (phase-locked to the controller's packages).
+    pub clock: String,
     /// SCHED_FIFO priority of the command thread; 0 asks for none.
     pub command_priority: u8,
     /// SCHED_FIFO priority of the vision thread, below the command thread's.
@@ -101,7 +101,7 @@ pub struct RawLoop {
     pub spin_us: f64,
     /// Refuse to start on a host that does not give priority and locked memory.
     pub require_realtime: bool,
-    /// Count missed beats instead of holding the arm for them, and allow twice the delay before a fault: for a shared or ordinary
+    /// Count missed cycles instead of holding the arm for them, and allow twice the delay before a fault: for a shared or ordinary
     /// host. Without real-time priority it is so in any case.
     pub best_effort: bool,
 }
@@ -110,7 +110,7 @@ impl Default for RawLoop {
     fn default() -> Self {
         Self {
             rate_hz: 0.0,
-            beat: "timer".into(),
+            clock: "timer".into(),
             command_priority: 80,
             vision_priority: 70,
             command_core: None,

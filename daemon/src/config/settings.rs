@@ -124,19 +124,19 @@ impl Config {
         let model = Model::from_name(&raw.arm.model).ok_or_else(|| {
             bad(path, "arm.model", &raw.arm.model, "use ur3, ur5, ur10, ur3e, ur5e, ur10e, ur16e, ur20 or ur30")
         })?;
-        if raw.beat.rate_hz == 0.0 {
-            raw.beat.rate_hz = controller_hz(model);
+        if raw.cycle.rate_hz == 0.0 {
+            raw.cycle.rate_hz = controller_hz(model);
         }
         check_numbers(path, &raw)?;
         check_outputs(path, &raw)?;
-        one_of(path, "loop.beat", &raw.beat.beat, &["timer", "robot"])?;
-        if raw.beat.beat == "robot" && raw.beat.rate_hz != controller_hz(model) {
+        one_of(path, "loop.clock", &raw.cycle.clock, &["timer", "robot"])?;
+        if raw.cycle.clock == "robot" && raw.cycle.rate_hz != controller_hz(model) {
             return Err(bad(
                 path,
                 "loop.rate_hz",
-                &raw.beat.rate_hz.to_string(),
+                &raw.cycle.rate_hz.to_string(),
                 &format!(
-                    "loop.beat = \"robot\" beats as the controller does: leave loop.rate_hz out, or set {}",
+                    "loop.clock = \"robot\" cycles as the controller does: leave loop.rate_hz out, or set {}",
                     controller_hz(model)
                 ),
             ));
@@ -176,7 +176,7 @@ impl Config {
         Ok(Self { raw, names, rig, gripper, link, model, kinematics, stop, files })
     }
 
-    /// Period of the command thread's beat, nanoseconds.
+    /// Period of the command thread's cycle, nanoseconds.
     pub fn period_ns(&self) -> u64 {
         period_ns(&self.raw)
     }
@@ -189,7 +189,7 @@ fn controller_hz(model: Model) -> f64 {
 
 fn period_ns(raw: &RawConfig) -> u64 {
     // check_numbers keeps the rate in 50..=1000 Hz.
-    (1e9 / raw.beat.rate_hz).round() as u64
+    (1e9 / raw.cycle.rate_hz).round() as u64
 }
 
 /// The limits as the loop will build them: what it would refuse is refused here, by the keys of the file.
@@ -271,10 +271,10 @@ fn check_outputs(path: &Path, c: &RawConfig) -> Result<(), Failure> {
 fn check_numbers(path: &Path, c: &RawConfig) -> Result<(), Failure> {
     let ranges: &[(&str, f64, f64, f64)] = &[
         ("arm.watchdog_ms", c.arm.watchdog_ms, 20.0, 200.0),
-        ("loop.rate_hz", c.beat.rate_hz, 50.0, 1000.0),
-        ("loop.command_priority", f64::from(c.beat.command_priority), 0.0, 98.0),
-        ("loop.vision_priority", f64::from(c.beat.vision_priority), 0.0, 97.0),
-        ("loop.spin_us", c.beat.spin_us, 0.0, 4000.0),
+        ("loop.rate_hz", c.cycle.rate_hz, 50.0, 1000.0),
+        ("loop.command_priority", f64::from(c.cycle.command_priority), 0.0, 98.0),
+        ("loop.vision_priority", f64::from(c.cycle.vision_priority), 0.0, 97.0),
+        ("loop.spin_us", c.cycle.spin_us, 0.0, 4000.0),
         ("vision.poll_us", c.vision.poll_us, 100.0, 20_000.0),
         ("vision.frame_rate_hz", c.vision.frame_rate_hz, 1.0, 1000.0),
         ("vision.max_skew_ms", c.vision.max_skew_ms, 0.0, 100.0),
@@ -294,12 +294,12 @@ fn check_numbers(path: &Path, c: &RawConfig) -> Result<(), Failure> {
             return Err(bad(path, key, &value.to_string(), &format!("must lie between {low} and {high}")));
         }
     }
-    if c.beat.vision_priority >= c.beat.command_priority && c.beat.vision_priority > 0 {
+    if c.cycle.vision_priority >= c.cycle.command_priority && c.cycle.vision_priority > 0 {
         return Err(bad(
             path,
             "loop.vision_priority",
-            &c.beat.vision_priority.to_string(),
-            "must lie below loop.command_priority, so that tracking never delays the arm's beat",
+            &c.cycle.vision_priority.to_string(),
+            "must lie below loop.command_priority, so that tracking never delays the arm's cycle",
         ));
     }
     Ok(())

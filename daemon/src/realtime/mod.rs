@@ -1,9 +1,9 @@
-//! What makes a thread a real-time thread: priority, place, locked memory, and a beat on an absolute grid.
+//! What makes a thread a real-time thread: priority, place, locked memory, and a cycle on an absolute grid.
 
-mod beat;
+mod cycle_timer;
 mod setup;
 mod sys;
 
-pub use beat::{Beat, Tick, now_ns, sleep_until};
+pub use cycle_timer::{CycleTimer, Tick, now_ns, sleep_until};
 pub use setup::{RealtimeReport, ThreadSettings, enter, lock_memory};
 pub use sys::{exit_now, ignore_background_writes, thread_faults};

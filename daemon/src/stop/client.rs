@@ -21,7 +21,7 @@ const SOCKET: Duration = Duration::from_millis(500);
 pub enum Heard {
     /// The daemon's stop thread answered: whether the command thread has taken the stop, and the mode.
     Socket {
-        /// Whether a beat has taken the stop.
+        /// Whether a cycle has taken the stop.
         taken: bool,
         /// The mode as the daemon says it.
         mode: String,

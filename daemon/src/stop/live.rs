@@ -4,7 +4,7 @@ use graspd_rt::mode::ModeName;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
 
-/// Number of a mode before the first beat.
+/// Number of a mode before the first cycle.
 const STARTING: u8 = u8::MAX;
 
 /// No exit code of ours.
@@ -53,9 +53,9 @@ impl By {
 /// The command thread's state as it is now, and the latch that stops it.
 #[derive(Debug)]
 pub struct Live {
-    /// Set to stop at the next beat, ahead of every queued request. A signal handler sets it too.
+    /// Set to stop at the next cycle, ahead of every queued request. A signal handler sets it too.
     pub latch: Arc<AtomicBool>,
-    /// Set to end the process; from then on every beat asks for a stop, and no other request is taken.
+    /// Set to end the process; from then on every cycle asks for a stop, and no other request is taken.
     pub end: Arc<AtomicBool>,
     /// A signal was among what set the latch.
     pub by_signal: Arc<AtomicBool>,
@@ -63,7 +63,7 @@ pub struct Live {
     mode: AtomicU8,
     moving: AtomicBool,
     linked: AtomicBool,
-    beats: AtomicU64,
+    cycles: AtomicU64,
     /// Exit code of the ordered end, once it has come about.
     verdict: AtomicU8,
     over: AtomicBool,
@@ -79,7 +79,7 @@ impl Default for Live {
             mode: AtomicU8::new(STARTING),
             moving: AtomicBool::new(false),
             linked: AtomicBool::new(false),
-            beats: AtomicU64::new(0),
+            cycles: AtomicU64::new(0),
             verdict: AtomicU8::new(NO_VERDICT),
             over: AtomicBool::new(false),
         }
@@ -93,7 +93,7 @@ impl Live {
         self.latch.store(true, Ordering::Release);
     }
 
-    /// Whether this beat has to ask for a stop. Takes the latch.
+    /// Whether this cycle has to ask for a stop. Takes the latch.
     pub fn take(&self) -> bool {
         self.latch.swap(false, Ordering::AcqRel) || self.ending()
     }
@@ -129,21 +129,21 @@ impl Live {
         self.over.load(Ordering::Acquire)
     }
 
-    /// The command thread's note at the end of a beat.
+    /// The command thread's note at the end of a cycle.
     pub fn note(&self, mode: ModeName, moving: bool, linked: bool) {
         self.mode.store(mode as u8, Ordering::Relaxed);
         self.moving.store(moving, Ordering::Relaxed);
         self.linked.store(linked, Ordering::Relaxed);
-        // Released last: who sees the new count sees the beat's mode.
-        self.beats.fetch_add(1, Ordering::Release);
+        // Released last: who sees the new count sees the cycle's mode.
+        self.cycles.fetch_add(1, Ordering::Release);
     }
 
-    /// Beats noted.
-    pub fn beats(&self) -> u64 {
-        self.beats.load(Ordering::Acquire)
+    /// Cycles noted.
+    pub fn cycles(&self) -> u64 {
+        self.cycles.load(Ordering::Acquire)
     }
 
-    /// The mode after the last beat; `None` before the first.
+    /// The mode after the last cycle; `None` before the first.
     pub fn mode(&self) -> Option<ModeName> {
         let number = self.mode.load(Ordering::Relaxed);
         [
@@ -164,7 +164,7 @@ impl Live {
         self.moving.load(Ordering::Relaxed)
     }
 
-    /// Whether a controller was at the other end of the last beat.
+    /// Whether a controller was at the other end of the last cycle.
     pub fn linked(&self) -> bool {
         self.linked.load(Ordering::Relaxed)
     }
@@ -185,15 +185,18 @@ mod tests {
     }
 
     #[test]
-    fn what_a_beat_notes_is_what_is_read() {
+    fn what_a_cycle_notes_is_what_is_read() {
         let live = Live::default();
         assert_eq!(live.mode(), None);
         live.note(ModeName::Servoing, true, true);
         assert_eq!(
-            (live.mode(), live.moving(), live.linked(), live.beats()),
+            (live.mode(), live.moving(), live.linked(), live.cycles()),
             (Some(ModeName::Servoing), true, true, 1)
         );
         live.note(ModeName::Fault, false, false);
-        assert_eq!((live.mode(), live.moving(), live.linked(), live.beats()), (Some(ModeName::Fault), false, false, 2));
+        assert_eq!(
+            (live.mode(), live.moving(), live.linked(), live.cycles()),
+            (Some(ModeName::Fault), false, false, 2)
+        );
     }
 }

@@ -3,7 +3,7 @@
 //!
 //! | way | what it goes through |
 //! |---|---|
-//! | SIGUSR1 | the signal handler stores into the latch; the command thread takes it at its next beat |
+//! | SIGUSR1 | the signal handler stores into the latch; the command thread takes it at its next cycle |
 //! | SIGTERM, SIGINT, SIGHUP | the same, and the process ends once the arm rests |
 //! | `<cell>.stop` | a socket of mode 0600 in the runtime folder, served by the stop thread ([`serve`]) |
 //! | the verb | shared memory and the service thread; the last resort of `graspd stop`, the way of consoles |

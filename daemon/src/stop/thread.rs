@@ -17,7 +17,7 @@ use std::sync::Arc;
 const CLIENTS: usize = 16;
 /// How long a connection may take to ask, ns.
 const PATIENCE_NS: u64 = 250_000_000;
-/// How long the answer waits for the ramp to begin, ns: many beats.
+/// How long the answer waits for the ramp to begin, ns: many cycles.
 const RAMP_NS: u64 = 100_000_000;
 /// Pause after a round that had work: a flood of connections gets at most so many rounds a second, and no processor.
 const PAUSE_NS: i64 = 500_000;
@@ -31,7 +31,7 @@ pub struct End {
     pub after_ns: u64,
     /// After the ordered end has come about and only threads are waited for, ns; with that end's own code.
     pub settled_ns: u64,
-    /// The exit code where no ordered end has come about; 0 where no beat has run and nothing could move.
+    /// The exit code where no ordered end has come about; 0 where no cycle has run and nothing could move.
     pub code: u8,
 }
 
@@ -46,7 +46,7 @@ impl End {
             return Some(code);
         }
         let late = live.ending() && passed(asked, self.after_ns);
-        late.then(|| live.settled().unwrap_or(if live.beats() == 0 { 0 } else { self.code }))
+        late.then(|| live.settled().unwrap_or(if live.cycles() == 0 { 0 } else { self.code }))
     }
 }
 
@@ -55,7 +55,7 @@ struct Client {
     stream: UnixStream,
     since_ns: u64,
     heard: usize,
-    /// The beat at which the latch was pulled for this client, and when.
+    /// The cycle at which the latch was pulled for this client, and when.
     asked: Option<(u64, u64)>,
 }
 
@@ -122,10 +122,10 @@ fn may_stop(stream: &UnixStream, uid: u32) -> bool {
 impl Client {
     /// Reads, asks, answers; true when the connection is done with.
     fn look(&mut self, live: &Live, now: u64) -> bool {
-        if let Some((beat, at)) = self.asked {
+        if let Some((cycle, at)) = self.asked {
             let mode = live.mode();
-            // The beat after the one that may have been under way has taken the latch.
-            let taken = live.beats() >= beat + 2 && !matches!(mode, Some(ModeName::Servoing | ModeName::Converged));
+            // The cycle after the one that may have been under way has taken the latch.
+            let taken = live.cycles() >= cycle + 2 && !matches!(mode, Some(ModeName::Servoing | ModeName::Converged));
             if taken || mode.is_none() || now.saturating_sub(at) > RAMP_NS {
                 let _ = self.stream.write(answer(taken, mode));
                 return true;
@@ -145,7 +145,7 @@ impl Client {
             Err(_) => return true,
         }
         if self.heard == WORD.len() {
-            self.asked = Some((live.beats(), now));
+            self.asked = Some((live.cycles(), now));
             live.stop(By::Socket);
             return false;
         }
@@ -153,7 +153,7 @@ impl Client {
     }
 }
 
-/// `stopped MODE`, or `late MODE` when no beat has taken the latch in time.
+/// `stopped MODE`, or `late MODE` when no cycle has taken the latch in time.
 const fn answer(taken: bool, mode: Option<ModeName>) -> &'static [u8] {
     match (taken, mode) {
         (_, None) => b"stopped starting\n",

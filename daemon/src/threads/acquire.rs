@@ -1,5 +1,5 @@
 //! The acquisition thread: finds the marks from scratch whenever the vision thread has lost them. An ordinary thread: it searches
-//! whole pictures, which may take tens of milliseconds.
+//! whole images, which may take tens of milliseconds.
 
 use super::shared::{RigSeen, Seed, Shared};
 use super::vision::policy;
@@ -33,7 +33,7 @@ impl AcquireReport {
 
 fn words(failure: &AcquireFailure) -> String {
     match failure {
-        AcquireFailure::Size(view) => format!("the {view:?} picture has not the size of the rig's camera"),
+        AcquireFailure::Size(view) => format!("the {view:?} image has not the size of the rig's camera"),
         AcquireFailure::TooFewBlobs { found } => format!(
             "too few round marks in sight ({} left, {} right): marks hidden, out of focus, too dark or too small",
             found[0], found[1]
@@ -45,14 +45,14 @@ fn words(failure: &AcquireFailure) -> String {
             "no four marks stand as in the gripper file: another gripper, or wrong mark positions".into()
         }
         AcquireFailure::NotVerified { seen, residual_px } => format!(
-            "a pose was found but does not hold in the pictures ({} and {} marks, residual {residual_px:.1} px)",
+            "a pose was found but does not hold in the images ({} and {} marks, residual {residual_px:.1} px)",
             seen[0], seen[1]
         ),
         AcquireFailure::RigOff { sigmas, residual_px } => format!(
             "the marks fit only with a rig {sigmas:.0} times as wrong as it states (residual {residual_px:.1} px): a camera was moved, rig.toml is another rig's, or this gripper has another size; check the calibration, or state its error in [quality]"
         ),
         AcquireFailure::Ambiguous { .. } => {
-            "two poses explain the pictures equally well: the mark that tells them apart is hidden, or the layout is symmetric".into()
+            "two poses explain the images equally well: the mark that tells them apart is hidden, or the layout is symmetric".into()
         }
     }
 }

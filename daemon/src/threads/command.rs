@@ -1,16 +1,16 @@
-//! The command thread: a beat of its own, robot state in, one set-point out. It touches no iceoryx2, no lock and no heap.
+//! The command thread: a cycle of its own, robot state in, one set-point out. It touches no iceoryx2, no lock and no heap.
 
 use super::shared::{JointSample, Shared};
-use super::telemetry::BeatRecord;
+use super::telemetry::CycleReport;
 use crate::arm::{ArmLink, LinkPoll};
-use crate::realtime::{Beat, Tick, now_ns, sleep_until};
+use crate::realtime::{CycleTimer, Tick, now_ns, sleep_until};
 use graspd_rt::arm::RobotState;
 use graspd_rt::cycle::{CommandCycle, CommandInput, LinkStatus};
 use graspd_rt::online::Vision;
 use graspd_rt::rtde::PhaseLock;
 use std::sync::atomic::Ordering;
 
-/// Commands whose sending time is kept, to measure the round trip by the echoed beat.
+/// Commands whose sending time is kept, to measure the round trip by the echoed heartbeat.
 const SENT: usize = 256;
 
 /// The command thread's state.
@@ -52,14 +52,14 @@ impl<'a> CommandWorker<'a> {
 
     /// Runs until shutdown.
     pub fn run(&mut self, period_ns: u64, spin_ns: u64) {
-        let mut beat = Beat::new(period_ns, spin_ns);
+        let mut timer = CycleTimer::new(period_ns, spin_ns);
         while !self.shared.ending() {
-            let tick = beat.wait();
-            self.beat(&tick);
+            let tick = timer.wait();
+            self.cycle(&tick);
         }
     }
 
-    /// Runs until shutdown on the robot's beat: its package, then the command, which so lands in its next step. Without a robot, or
+    /// Runs until shutdown on the robot's cycle: its package, then the command, which so lands in its next step. Without a robot, or
     /// with one that is silent, a timer.
     pub fn run_with_robot(&mut self, period_ns: u64) {
         let mut lock = PhaseLock::new(period_ns, now_ns());
@@ -75,14 +75,14 @@ impl<'a> CommandWorker<'a> {
                 sleep_until(lock.give_up_ns());
             }
             sleep_until(lock.arrived(now_ns(), come));
-            self.beat(&Tick { deadline_ns, woke_ns: now_ns(), skipped });
+            self.cycle(&Tick { deadline_ns, woke_ns: now_ns(), skipped });
             let stamp = self.robot.filter(|_| self.packages == 1).map(|r| r.timestamp_s);
             skipped = lock.advance(now_ns(), stamp);
         }
     }
 
-    /// One beat.
-    pub fn beat(&mut self, tick: &Tick) {
+    /// One cycle.
+    pub fn cycle(&mut self, tick: &Tick) {
         if self.link.is_none()
             && let Some(link) = self.shared.link_ready.take()
         {
@@ -100,8 +100,8 @@ impl<'a> CommandWorker<'a> {
             let _ = self.shared.joints.push(JointSample { at_ns: s.received_ns, q: s.q });
             if s.echo != self.echo {
                 self.echo = s.echo;
-                let (beat, at) = self.sent_ns[s.echo.rem_euclid(SENT as i32) as usize];
-                round_trip_ns = (beat == s.echo && at > 0).then(|| s.received_ns.saturating_sub(at));
+                let (cycle, at) = self.sent_ns[s.echo.rem_euclid(SENT as i32) as usize];
+                round_trip_ns = (cycle == s.echo && at > 0).then(|| s.received_ns.saturating_sub(at));
             }
             self.robot = Some(*s);
         }
@@ -134,7 +134,7 @@ impl<'a> CommandWorker<'a> {
         if let Some(reply) = out.setpoint_reply {
             self.shared.setpoint_reply.put(reply);
         }
-        let note = BeatRecord {
+        let note = CycleReport {
             record: out.record,
             event: out.event,
             wakeup_ns: tick.lateness_ns(),
@@ -172,7 +172,7 @@ impl<'a> CommandWorker<'a> {
         match link.send(command) {
             Ok(()) if link.stats().dropped == dropped => {
                 self.status.blocked_sends = 0;
-                self.sent_ns[command.beat.rem_euclid(SENT as i32) as usize] = (command.beat, now_ns());
+                self.sent_ns[command.heartbeat.rem_euclid(SENT as i32) as usize] = (command.heartbeat, now_ns());
             }
             Ok(()) => self.status.blocked_sends = self.status.blocked_sends.saturating_add(1),
             Err(_) => self.drop_link(),

@@ -4,7 +4,7 @@
 //!  camera ─► shm ─► vision (FIFO, lower) ──Slot<Vision>──► command (FIFO, higher) ─► robot
 //!               └─► acquire (ordinary) ──Slot<Seed>──┘ ▲        │        ▲
 //!                                                joints└────────┘        │ requests, set-point, stop latch
-//!                    telemetry (ordinary) ◄──ring of BeatRecord──┘       │
+//!                    telemetry (ordinary) ◄──ring of CycleReport──┘       │
 //!                    service (ordinary): verbs, signals, supervision ────┘   link manager (ordinary): connect, hand over, reconnect
 //! ```
 
@@ -29,6 +29,6 @@ pub use report::Report;
 pub use service::{Service, ramp_limit};
 pub use shared::{JointSample, Seed, Shared, VisionCounters};
 pub use slot::Slot;
-pub use telemetry::{BeatRecord, fault_number, run as run_telemetry, why_words};
+pub use telemetry::{CycleReport, fault_number, run as run_telemetry, why_words};
 pub use timing::Latency;
 pub use vision::{VisionWorker, policy};

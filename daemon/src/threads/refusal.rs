@@ -10,14 +10,14 @@ pub enum Refusal {
     Topic(Reject),
     /// By the tracker.
     Tracker(FrameReject),
-    /// Its payload does not hold the pictures that its header promises.
-    Pictures,
-    /// The picture repeats byte by byte while the arm moves (C03).
+    /// Its payload does not hold the images that its header promises.
+    Images,
+    /// The image repeats byte by byte while the arm moves (C03).
     Frozen,
 }
 
 const TRACKER: [&str; 7] = [
-    "a picture has not the size of the rig's camera",
+    "an image has not the size of the rig's camera",
     "the sequence number repeats or goes back",
     "a capture stamp does not advance",
     "left and right were exposed too far apart: check the cameras' trigger (vision.max_skew_ms)",
@@ -25,7 +25,7 @@ const TRACKER: [&str; 7] = [
     "a capture stamp lies in the future: stamps are CLOCK_MONOTONIC nanoseconds",
     "the marks are farther from their last place than the gripper can have moved",
 ];
-const PICTURES: u32 = 200;
+const IMAGES: u32 = 200;
 const FROZEN: u32 = 201;
 
 impl Refusal {
@@ -44,7 +44,7 @@ impl Refusal {
                     FrameReject::Jump { .. } => 6,
                 }
             }
-            Refusal::Pictures => PICTURES,
+            Refusal::Images => IMAGES,
             Refusal::Frozen => FROZEN,
         }
     }
@@ -53,8 +53,8 @@ impl Refusal {
     pub fn words(number: u32) -> String {
         match number {
             0 => String::new(),
-            PICTURES => "the payload does not hold the pictures that the header promises".to_owned(),
-            FROZEN => "the picture repeats while the arm moves: the camera or its driver is frozen".to_owned(),
+            IMAGES => "the payload does not hold the images that the header promises".to_owned(),
+            FROZEN => "the image repeats while the arm moves: the camera or its driver is frozen".to_owned(),
             n => {
                 let topic = n.checked_sub(1).and_then(|i| Reject::ALL.get(i as usize)).map(ToString::to_string);
                 let tracker = n.checked_sub(100).and_then(|i| TRACKER.get(i as usize)).map(|w| (*w).to_owned());
@@ -80,7 +80,7 @@ mod tests {
             FrameReject::Jump { um: 1, mrad: 1 },
         ]
         .map(Refusal::Tracker);
-        for r in topic.into_iter().chain(tracker).chain([Refusal::Pictures, Refusal::Frozen]) {
+        for r in topic.into_iter().chain(tracker).chain([Refusal::Images, Refusal::Frozen]) {
             let words = Refusal::words(r.number());
             assert!(words.len() > 10 && !words.starts_with("reason"), "{r:?}: {words}");
             seen.insert(r.number());

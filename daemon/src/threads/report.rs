@@ -97,8 +97,8 @@ impl Report {
         }
     }
 
-    /// Notes a beat.
-    pub fn beat(&self, record: &CycleRecord) {
+    /// Notes a cycle.
+    pub fn cycle(&self, record: &CycleRecord) {
         let mut s = self.lock();
         s.lasting = record.lasting;
         (s.grip, s.image_age_ns) = (record.grip, record.vision_age_ns);
@@ -134,7 +134,7 @@ impl Report {
         }
     }
 
-    /// Notes why pictures are being refused; empty when they are not.
+    /// Notes why images are being refused; empty when they are not.
     pub fn refusal(&self, words: &str) {
         words.clone_into(&mut self.lock().refusal);
     }
@@ -224,7 +224,7 @@ impl Report {
         self.setpoints.pop()
     }
 
-    /// The whole state as one JSON object, with what else the caller knows. Mode and motion are the last beat's own; nothing is formatted under
+    /// The whole state as one JSON object, with what else the caller knows. Mode and motion are the last cycle's own; nothing is formatted under
     /// the lock.
     pub fn json(&self, accepted: bool, reason: Option<&str>, marks: &str, live: &Live, more: Value) -> String {
         let (_, image_age_ms) = self.images();

@@ -29,7 +29,7 @@ const MAX_AHEAD_NS: u64 = 1_000_000;
 const OLD_IMAGE_MS: f64 = 100.0;
 /// How long ending the control script may take; the arm rests already.
 const SCRIPT_END: Duration = Duration::from_millis(300);
-/// How long the command thread may take to answer: many beats.
+/// How long the command thread may take to answer: many cycles.
 const ANSWER_WITHIN: Duration = Duration::from_millis(500);
 
 /// What the service thread needs.
@@ -88,7 +88,7 @@ impl Service<'_> {
         })
     }
 
-    /// A refusal in words; where the robot or the pictures are what is missing, with all that the status knows of them.
+    /// A refusal in words; where the robot or the images are what is missing, with all that the status knows of them.
     fn refused(&self, kind: RequestKind, reject: Reject) -> String {
         let words = advice::refusal(kind, self.shared.live.mode().unwrap_or(ModeName::Idle), reject);
         let mut causes: Vec<String> = self.report.lasting().into_iter().collect();
@@ -192,7 +192,7 @@ impl Service<'_> {
     /// Serves until the end is asked for, or a thread broke. Then the arm is ramped down before this returns.
     pub fn serve(&self, server: &RequestServer) {
         let mut id = 1;
-        let mut beats = (0, Instant::now());
+        let mut cycles = (0, Instant::now());
         let mut failing = false;
         while !self.shared.live.ending() && !self.shared.broken.load(Ordering::Acquire) {
             match server.next() {
@@ -208,10 +208,10 @@ impl Service<'_> {
                     std::thread::sleep(Duration::from_millis(200));
                 }
             }
-            let now = self.shared.live.beats();
-            if now != beats.0 {
-                beats = (now, Instant::now());
-            } else if beats.1.elapsed() > Duration::from_secs(2) {
+            let now = self.shared.live.cycles();
+            if now != cycles.0 {
+                cycles = (now, Instant::now());
+            } else if cycles.1.elapsed() > Duration::from_secs(2) {
                 log::say(
                     "the command thread has stood still for 2 s; ending, so that the robot's own watchdog holds it stopped",
                 );
@@ -225,10 +225,10 @@ impl Service<'_> {
     fn ramp_down(&self) {
         let live = &self.shared.live;
         live.stop(By::Ending);
-        // From here on every beat asks for a stop, also where no signal has asked for the end.
+        // From here on every cycle asks for a stop, also where no signal has asked for the end.
         live.end.store(true, Ordering::Release);
-        let (from, until) = (live.beats(), Instant::now() + ramp_limit(self.config));
-        while Instant::now() < until && (live.moving() || live.beats() < from + 2) {
+        let (from, until) = (live.cycles(), Instant::now() + ramp_limit(self.config));
+        while Instant::now() < until && (live.moving() || live.cycles() < from + 2) {
             std::thread::sleep(Duration::from_millis(2));
         }
         if self.config.link == LinkKind::Rtde && live.linked() && !live.moving() {

@@ -1,7 +1,7 @@
 //! What the threads share: bounded slots and queues, made before the loop starts.
 
 use super::slot::Slot;
-use super::telemetry::BeatRecord;
+use super::telemetry::CycleReport;
 use crate::arm::ArmLink;
 use crate::log;
 use crate::stop::Live;
@@ -78,14 +78,14 @@ pub struct Shared {
     pub setpoint: Slot<SetPoint>,
     /// Command to service: the answer to an offered set-point.
     pub setpoint_reply: Slot<Result<(), Reject>>,
-    /// Service to command: requests, one taken a beat.
+    /// Service to command: requests, one taken a cycle.
     pub requests: ArrayQueue<Request>,
     /// Command to service: answers.
     pub replies: ArrayQueue<Reply>,
-    /// The stop latch, ahead of every queued request, and what the last beat did.
+    /// The stop latch, ahead of every queued request, and what the last cycle did.
     pub live: Arc<Live>,
     /// Command to telemetry: what was noted.
-    pub records: ArrayQueue<BeatRecord>,
+    pub records: ArrayQueue<CycleReport>,
     /// Link manager to command: a link that is ready.
     pub link_ready: Slot<Box<dyn ArmLink>>,
     /// Command to link manager: a link that died.
@@ -95,7 +95,7 @@ pub struct Shared {
     /// Counters of the vision thread.
     pub counters: VisionCounters,
     /// Counts looks of the vision thread.
-    pub vision_beat: AtomicU64,
+    pub vision_cycles: AtomicU64,
     /// Set when a thread ended by a panic: the command thread stops the arm, the process ends with a failure.
     pub broken: AtomicBool,
     /// What happened to the shared memory, once something did.
@@ -123,7 +123,7 @@ impl Default for Shared {
             link_dead: Slot::default(),
             drop_link: AtomicBool::new(false),
             counters: VisionCounters::default(),
-            vision_beat: AtomicU64::new(0),
+            vision_cycles: AtomicU64::new(0),
             broken: AtomicBool::new(false),
             damage: OnceLock::new(),
             shutdown: AtomicBool::new(false),

@@ -17,9 +17,9 @@ use graspd_shm::control::{ControlError, TelemetryPublisher, TelemetrySample};
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-/// What the command thread notes about one beat.
+/// What the command thread notes about one cycle.
 #[derive(Clone, Copy, Debug)]
-pub struct BeatRecord {
+pub struct CycleReport {
     /// What the cycle knew and did.
     pub record: CycleRecord,
     /// A change of mode.
@@ -28,9 +28,9 @@ pub struct BeatRecord {
     pub wakeup_ns: u64,
     /// From waking to the command sent, ns.
     pub compute_ns: u64,
-    /// Whole periods missed before this beat.
+    /// Whole periods missed before this cycle.
     pub skipped: u64,
-    /// From the exposure of a pair to this command, in the first beat that used the pair.
+    /// From the exposure of a pair to this command, in the first cycle that used the pair.
     pub frame_to_command_ns: Option<u64>,
     /// From a command to its echo, when a new echo came.
     pub round_trip_ns: Option<u64>,
@@ -96,20 +96,20 @@ pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &Report) ->
         let ending = shared.ending();
         refusals(shared, report, &mut refusal, &mut refused);
         let mut last = None;
-        while let Some(beat) = shared.records.pop() {
+        while let Some(cycle) = shared.records.pop() {
             // Percentiles are of the loop in service: from the first arming on, and afresh with each.
-            if beat.event.is_some_and(|e| e.to == ModeName::Servoing && e.from == ModeName::Armed) {
+            if cycle.event.is_some_and(|e| e.to == ModeName::Servoing && e.from == ModeName::Armed) {
                 latencies = Latencies::default();
                 settled = true;
             }
-            note(&mut latencies, &beat);
-            if let Some(event) = beat.event {
+            note(&mut latencies, &cycle);
+            if let Some(event) = cycle.event {
                 let mut why = why_words(&event.why);
                 if event.why == Why::Request(RequestKind::Stop) {
                     why = format!("{why}, by {}", shared.live.who());
                 }
                 if let (Why::Fault(FaultCause::FramesStale { .. }), false) = (event.why, refused.is_empty()) {
-                    why = format!("{why}; pictures were refused: {refused}");
+                    why = format!("{why}; images were refused: {refused}");
                 }
                 log::say(format_args!("{} -> {}: {why}", event.from.as_str(), event.to.as_str()));
                 report.transition(&event, &why);
@@ -128,7 +128,7 @@ pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &Report) ->
                     _ => {}
                 }
             }
-            last = Some(beat);
+            last = Some(cycle);
         }
         while let Some(next) = report.setpoint_for_telemetry() {
             setpoint = Some(next);
@@ -136,9 +136,9 @@ pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &Report) ->
         if let Some(vision) = shared.vision_seen.take() {
             marks(&mut sample, &vision);
         }
-        if let Some(beat) = last {
-            fill(&mut sample, &beat, setpoint.as_ref());
-            report.beat(&beat.record);
+        if let Some(cycle) = last {
+            fill(&mut sample, &cycle, setpoint.as_ref());
+            report.cycle(&cycle.record);
         }
         sample.frames = shared.counters.frames.load(Ordering::Relaxed);
         sample.frames_skipped = shared.counters.skipped.load(Ordering::Relaxed);
@@ -160,7 +160,7 @@ pub fn run(config: &Config, node: &ShmNode, shared: &Shared, report: &Report) ->
     }
 }
 
-/// Says once why pictures are refused. `seen` is the count, the reason and the time of the last refusal; `words` are those of the last
+/// Says once why images are refused. `seen` is the count, the reason and the time of the last refusal; `words` are those of the last
 /// second, for the fault that may follow.
 fn refusals(shared: &Shared, report: &Report, seen: &mut (u64, u32, Instant), words: &mut String) {
     let count = shared.counters.refused.load(Ordering::Relaxed);
@@ -168,7 +168,7 @@ fn refusals(shared: &Shared, report: &Report, seen: &mut (u64, u32, Instant), wo
     if count != seen.0 {
         if why != seen.1 || words.is_empty() {
             *words = Refusal::words(why);
-            log::say(format_args!("pictures are refused: {words}"));
+            log::say(format_args!("images are refused: {words}"));
             report.refusal(words);
         }
         *seen = (count, why, Instant::now());
@@ -178,19 +178,19 @@ fn refusals(shared: &Shared, report: &Report, seen: &mut (u64, u32, Instant), wo
     }
 }
 
-fn note(l: &mut Latencies, beat: &BeatRecord) {
-    l.wakeup.note(beat.wakeup_ns);
-    l.compute.note(beat.compute_ns);
-    if let Some(ns) = beat.frame_to_command_ns {
+fn note(l: &mut Latencies, cycle: &CycleReport) {
+    l.wakeup.note(cycle.wakeup_ns);
+    l.compute.note(cycle.compute_ns);
+    if let Some(ns) = cycle.frame_to_command_ns {
         l.frame.note(ns);
     }
-    if let Some(ns) = beat.round_trip_ns {
+    if let Some(ns) = cycle.round_trip_ns {
         l.round_trip.note(ns);
     }
 }
 
-fn fill(sample: &mut TelemetrySample, beat: &BeatRecord, setpoint: Option<&SetPoint>) {
-    let r = &beat.record;
+fn fill(sample: &mut TelemetrySample, cycle: &CycleReport, setpoint: Option<&SetPoint>) {
+    let r = &cycle.record;
     sample.stamp_ns = r.now_ns;
     sample.state = r.mode as u32;
     sample.phase = match (r.mode, r.stage) {
@@ -201,11 +201,11 @@ fn fill(sample: &mut TelemetrySample, beat: &BeatRecord, setpoint: Option<&SetPo
         (ModeName::Servoing, Stage::Retreat) => 6,
         _ => 0,
     };
-    sample.ticks = r.counters.beats;
+    sample.ticks = r.counters.cycles;
     sample.overruns = r.counters.overruns;
     sample.setpoint = r.setpoint_id;
-    sample.link = beat.link;
-    (sample.robot_mode, sample.safety_bits) = beat.robot;
+    sample.link = cycle.link;
+    (sample.robot_mode, sample.safety_bits) = cycle.robot;
     sample.limits_active = u32::from(r.held.0);
     sample.q = r.q;
     sample.qd = r.qd;

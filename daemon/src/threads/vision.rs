@@ -1,9 +1,9 @@
-//! The vision thread: newest pair, track, gripper pose. It owns the frame subscriber, and nothing it does can delay the arm's beat.
+//! The vision thread: newest pair, track, gripper pose. It owns the frame subscriber, and nothing it does can delay the arm's cycle.
 
 use super::refusal::Refusal;
 use super::shared::{RigSeen, Seed, Shared};
 use crate::config::Config;
-use crate::realtime::{Beat, now_ns};
+use crate::realtime::{CycleTimer, now_ns};
 use crate::stop::By;
 use graspd_rt::arm::Dh;
 use graspd_rt::geom::Pose;
@@ -15,9 +15,9 @@ use graspd_shm::frame::{FramePolicy, FrameSubscriber, SourceEvent};
 use graspd_shm::{ShmError, ShmNode};
 use std::sync::atomic::Ordering;
 
-/// Equal pictures in a row that are no accident any more.
+/// Equal images in a row that are no accident any more.
 const FROZEN_FRAMES: u32 = 5;
-/// Joint motion within the last tenth of a second that a picture has to show, rad.
+/// Joint motion within the last tenth of a second that an image has to show, rad.
 const SEEN_MOTION: f64 = 1e-3;
 
 /// Joints this much older than a pair say nothing about where the arm was then, ns: ten packages of 500 Hz.
@@ -83,11 +83,11 @@ impl<'a> VisionWorker<'a> {
 
     /// Runs until shutdown.
     pub fn run(&mut self, poll_ns: u64) {
-        let mut beat = Beat::new(poll_ns, 0);
+        let mut timer = CycleTimer::new(poll_ns, 0);
         while !self.shared.ending() {
-            beat.wait();
+            timer.wait();
             self.look();
-            self.shared.vision_beat.fetch_add(1, Ordering::Relaxed);
+            self.shared.vision_cycles.fetch_add(1, Ordering::Relaxed);
         }
     }
 
@@ -128,14 +128,14 @@ impl<'a> VisionWorker<'a> {
             ok.then_some((w, false))
         };
         let (Some(l), Some(r)) = (view(0), view(1)) else {
-            refuse(Refusal::Pictures);
+            refuse(Refusal::Images);
             return;
         };
         let bytes =
             |eye: usize, direct: bool| if direct { frame.mono8(eye).unwrap_or(&[]) } else { &converted[eye][..] };
-        let pictures = (ImageView::new(bytes(0, l.1), w, h, l.0), ImageView::new(bytes(1, r.1), w, h, r.0));
-        let (Some(left), Some(right)) = pictures else {
-            refuse(Refusal::Pictures);
+        let images = (ImageView::new(bytes(0, l.1), w, h, l.0), ImageView::new(bytes(1, r.1), w, h, r.0));
+        let (Some(left), Some(right)) = images else {
+            refuse(Refusal::Images);
             return;
         };
         let capture = frame.capture_ns();
@@ -155,7 +155,7 @@ impl<'a> VisionWorker<'a> {
         let base_from_gripper = joints.map(|q| dh.base_from_gripper(&q, flange_from_gripper));
         let pair = StereoFrame { left, right, sequence: frame.sequence(), capture_ns: capture, now_ns: now };
         match cycle.step(&pair, base_from_gripper) {
-            // What the pictures say is then old, whatever their stamps say: let it age.
+            // What the images say is then old, whatever their stamps say: let it age.
             Ok(_) if cycle.health().frozen_run >= FROZEN_FRAMES && moves(history, middle) => refuse(Refusal::Frozen),
             Ok(vision) => {
                 counters.frames.fetch_add(1, Ordering::Relaxed);

@@ -102,7 +102,7 @@ impl World {
         let mut renderer = scenario.renderer();
         let shot = scenario.snapshot(&scenario.start, 1);
         for (view, name) in [(View::Left, "left.png"), (View::Right, "right.png")] {
-            renderer.picture(view, &shot).save(folder.join(name)).unwrap();
+            renderer.image(view, &shot).save(folder.join(name)).unwrap();
         }
         let click = |eye: usize| Some(format!("{:.1},{:.1}", scenario.clicks[eye].x, scenario.clicks[eye].y));
         let done = run(&Request {

@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 
 /// From asking to the first set-point that slows down, ms (O09).
 pub(crate) const BOUND_MS: f64 = 20.0;
-/// Beats of the daemon come every 2 ms; a longer pause between two of them, ms, is a deadline that its cycle missed.
+/// Cycles of the daemon come every 2 ms; a longer pause between two of them, ms, is a deadline that its cycle missed.
 pub(crate) const MISSED_MS: f64 = 4.5;
 /// Slower than this is no motion to stop, rad/s.
 const MOVING: f64 = 0.02;
@@ -71,7 +71,7 @@ pub(crate) fn judge(entries: &[Entry], asked_ns: u64) -> Result<Stop, String> {
     let sent: Vec<(u64, [f64; 6])> = entries
         .iter()
         .filter_map(|e| match e {
-            Entry::Beat { at_ns, rates, .. } => Some((*at_ns, *rates)),
+            Entry::Heartbeat { at_ns, rates, .. } => Some((*at_ns, *rates)),
             _ => None,
         })
         .collect();

@@ -8,8 +8,8 @@ use std::path::PathBuf;
 /// One entry of interest.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Entry {
-    /// A command with this beat, mode word and rates (rad/s), and when the mock received it (ns of CLOCK_MONOTONIC).
-    Beat { beat: i32, mode: i32, at_ns: u64, rates: [f64; 6] },
+    /// A command with this heartbeat, mode word and rates (rad/s), and when the mock received it (ns of CLOCK_MONOTONIC).
+    Heartbeat { heartbeat: i32, mode: i32, at_ns: u64, rates: [f64; 6] },
     /// A control step: controller time, fastest target and true joint speed (rad/s), and when the mock took it (ns).
     Step { clock_s: f64, target: f64, speed: f64, at_ns: u64 },
     /// An event in words.
@@ -74,7 +74,7 @@ fn parse(b: &[u8]) -> Option<(Option<Entry>, usize)> {
 
 fn input(b: &[u8]) -> Option<(Option<Entry>, usize)> {
     let number = |name: &str| Field::input(name).unwrap().index() as u16;
-    let (mode_field, beat_field) = (number("input_int_register_24"), number("input_int_register_25"));
+    let (mode_field, heartbeat_field) = (number("input_int_register_24"), number("input_int_register_25"));
     let first_rate = number("input_double_register_24");
     let (mut n, mut found, mut mode, mut rates) = (18, None, 0, [0.0; 6]);
     let at_ns = u64::from_le_bytes(b.get(1..9)?.try_into().unwrap());
@@ -84,7 +84,7 @@ fn input(b: &[u8]) -> Option<(Option<Entry>, usize)> {
         let value = b.get(n + 3..n + 3 + length)?;
         // Values stand in the record as they stood on the wire: network order.
         let word = || i32::from_be_bytes(value.try_into().unwrap());
-        if field == beat_field {
+        if field == heartbeat_field {
             found = Some(word());
         } else if field == mode_field {
             mode = word();
@@ -93,5 +93,5 @@ fn input(b: &[u8]) -> Option<(Option<Entry>, usize)> {
         }
         n += 3 + length;
     }
-    Some((found.map(|beat| Entry::Beat { beat, mode, at_ns, rates }), n))
+    Some((found.map(|heartbeat| Entry::Heartbeat { heartbeat, mode, at_ns, rates }), n))
 }

@@ -21,7 +21,7 @@ use graspd_rt::setpoint::{Goal, SetPoint};
 use nalgebra::{Matrix2, Matrix6};
 
 pub(crate) const MS: u64 = 1_000_000;
-const BEAT: u64 = 2 * MS;
+const CYCLE: u64 = 2 * MS;
 /// From exposure to result.
 const DELAY: u64 = 30 * MS;
 
@@ -47,7 +47,7 @@ pub(crate) struct Cell {
     pipeline: VecDeque<(u64, Vision)>,
     next_capture: u64,
     sequence: u64,
-    /// Packages written in the last beat, which the server is to find in this one.
+    /// Packages written in the last cycle, which the server is to find in this one.
     on_the_way: u64,
 }
 
@@ -185,12 +185,12 @@ impl Cell {
         self.server.world.robot.truth.actual_qd.iter().fold(0.0, |m, v| v.abs().max(m))
     }
 
-    /// One beat: what was written arrives, the robot steps, its state arrives, the loop answers.
-    pub(crate) fn beat(&mut self, request: Option<RequestKind>, offer: bool) -> CommandOutput {
-        self.now += BEAT;
+    /// One cycle: what was written arrives, the robot steps, its state arrives, the loop answers.
+    pub(crate) fn cycle(&mut self, request: Option<RequestKind>, offer: bool) -> CommandOutput {
+        self.now += CYCLE;
         self.take_in();
         self.server.step(self.now);
-        self.take_picture();
+        self.take_image();
         let robot = self.poll();
         let mut vision = None;
         while self.pipeline.front().is_some_and(|(due, _)| *due <= self.now) {
@@ -252,7 +252,7 @@ impl Cell {
         }
     }
 
-    /// Lets the server read what was written in the last beat.
+    /// Lets the server read what was written in the last cycle.
     fn take_in(&mut self) {
         let wire = self.server.world.wire(Port::Rtde);
         let heard = wire.deaf_until <= self.now && wire.unread_until <= self.now;
@@ -267,7 +267,7 @@ impl Cell {
         }
     }
 
-    fn take_picture(&mut self) {
+    fn take_image(&mut self) {
         if self.now < self.next_capture {
             return;
         }
@@ -302,27 +302,27 @@ impl Cell {
         self.pipeline.push_back((self.now + DELAY, vision));
     }
 
-    /// Beats for so long.
+    /// Cycles for so long.
     pub(crate) fn run(&mut self, ms: u64) {
-        for _ in 0..ms * MS / BEAT {
-            self.beat(None, false);
+        for _ in 0..ms * MS / CYCLE {
+            self.cycle(None, false);
         }
     }
 
     /// Set-point in and armed; what the servo request answers.
     pub(crate) fn ask_servo(&mut self) -> Result<(), graspd_rt::mode::Reject> {
         self.run(600);
-        assert_eq!(self.beat(None, true).setpoint_reply, Some(Ok(())));
-        let armed = self.beat(Some(RequestKind::Arm), false).reply.unwrap().result;
+        assert_eq!(self.cycle(None, true).setpoint_reply, Some(Ok(())));
+        let armed = self.cycle(Some(RequestKind::Arm), false).reply.unwrap().result;
         assert_eq!(armed, Ok(()), "{:?}", self.cycle.mode());
-        self.beat(Some(RequestKind::Servo), false).reply.unwrap().result
+        self.cycle(Some(RequestKind::Servo), false).reply.unwrap().result
     }
 
     /// In motion, past the slow beginning.
     pub(crate) fn move_off(&mut self) {
         assert_eq!(self.ask_servo(), Ok(()));
         for _ in 0..5_000 {
-            let out = self.beat(None, false);
+            let out = self.cycle(None, false);
             assert!(self.cycle.mode().drives(), "{:?}", self.cycle.mode());
             if out.command.rates.iter().any(|r| r.abs() > 0.1) {
                 return;

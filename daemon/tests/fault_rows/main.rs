@@ -131,7 +131,7 @@ fn arrives(cell: &mut Cell, label: &str, r: &Row) {
     let reduced = matches!(r.orders[..], [Command::Reduced { on: true }]);
     let cap = 0.4 * 0.5;
     while cell.cycle.mode().name() != ModeName::Converged {
-        let out = cell.beat(None, false);
+        let out = cell.cycle(None, false);
         assert!(cell.cycle.mode().drives(), "{label}: {:?} {:?}", cell.cycle.mode(), cell.ended);
         assert!(out.event.is_none_or(|e| e.to == ModeName::Converged), "{label}: {:?}", out.event);
         let since = (cell.now - from) / MS;
@@ -148,7 +148,7 @@ fn stops(cell: &mut Cell, label: &str, codes: &[&str], bound: u64, injected: u64
     let mut named = None;
     let mut rest = None;
     while cell.now < injected + (bound + RAMP_MS) * MS {
-        let out = cell.beat(None, false);
+        let out = cell.cycle(None, false);
         let after = (cell.now - injected) / MS;
         let code = out.event.and_then(|e| match e.why {
             Why::Fault(cause) => Some((cause.code(), cause.to_string())),
@@ -170,12 +170,16 @@ fn stops(cell: &mut Cell, label: &str, codes: &[&str], bound: u64, injected: u64
         cell.order(order);
     }
     for _ in 0..250 {
-        cell.beat(None, false);
+        cell.cycle(None, false);
         assert!(cell.arm_speed() < 1e-3, "{label}: moves again by itself");
     }
     if latched {
         assert_eq!(cell.cycle.mode().fault().unwrap().cause.code(), code, "{label}");
-        assert_eq!(cell.beat(Some(RequestKind::Servo), false).reply.unwrap().result, Err(Reject::WrongMode), "{label}");
+        assert_eq!(
+            cell.cycle(Some(RequestKind::Servo), false).reply.unwrap().result,
+            Err(Reject::WrongMode),
+            "{label}"
+        );
     } else {
         assert_eq!(cell.cycle.mode().name(), ModeName::Armed, "{label}");
     }
@@ -201,13 +205,13 @@ fn a_client_that_falls_silent_leaves_an_arm_at_rest() {
         cell.silent = true;
         let mut rest = None;
         while cell.now < from + 1_000 * MS {
-            cell.beat(None, false);
+            cell.cycle(None, false);
             rest = if cell.arm_speed() < 1e-3 { rest.or(Some((cell.now - from) / MS)) } else { None };
         }
         let rest = rest.expect("still moving a second later");
         println!("{} silent client: at rest after {rest} ms", if deaf { "R15 no watchdog," } else { "R16" });
         assert!(rest <= 50 + RAMP_MS, "{rest} ms");
-        // With the watchdog the program is over; without it our own script waits for a beat that moves.
+        // With the watchdog the program is over; without it our own script waits for a cycle that moves.
         let runtime = cell.server.world.robot.runtime;
         assert_eq!(runtime == RuntimeState::Stopped, !deaf, "{runtime:?}");
     }
@@ -286,13 +290,13 @@ fn another_kind_of_arm_is_refused() {
 fn an_arm_that_does_not_obey_is_noticed() {
     let mut cell = Cell::start(&[], |_| {}).unwrap();
     cell.run(600);
-    cell.beat(None, true);
-    assert_eq!(cell.beat(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()));
+    cell.cycle(None, true);
+    assert_eq!(cell.cycle(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()));
     cell.run(300);
     let from = cell.now;
     cell.order(Command::Drift { joint: 2, rate: 0.05 });
     while cell.cycle.mode().fault().is_none() && cell.now < from + 1_000 * MS {
-        cell.beat(None, false);
+        cell.cycle(None, false);
     }
     let fault = cell.cycle.mode().fault().expect("a creeping arm was not noticed");
     let after = (fault.at_ns - from) / MS;
@@ -308,12 +312,12 @@ fn an_arm_that_does_not_obey_is_noticed() {
         let from = cell.now;
         cell.order(if slow { Command::Lag { seconds: 3.0 } } else { Command::Stuck { joint } });
         while cell.cycle.mode().drives() && cell.now < from + 4_000 * MS {
-            cell.beat(None, false);
+            cell.cycle(None, false);
         }
         let fault = *cell.cycle.mode().fault().unwrap_or_else(|| panic!("{what}: {:?}", cell.cycle.mode()));
         let after = (fault.at_ns - from) / MS;
         println!("B08 {what:<24} {} after {after} ms: {}", fault.cause.code(), fault.cause);
-        // The pictures may see it before the joints do.
+        // The images may see it before the joints do.
         let known = ["F-ARM-14", "F-ARM-05", "F-MRK-01", "F-MRK-02", "F-LAW-01"];
         assert!(known.contains(&fault.cause.code()), "{:?}", fault.cause);
         cell.order(Command::ClearFaults);
@@ -346,12 +350,12 @@ fn a_backlog_is_not_replayed() {
     let mut packages = Vec::new();
     for _ in 0..12 {
         let before = cell.link.as_ref().map(graspd::arm::ArmLink::stats).unwrap();
-        cell.beat(None, false);
+        cell.cycle(None, false);
         let after = cell.link.as_ref().map(graspd::arm::ArmLink::stats).unwrap();
         packages.push((after.received - before.received, after.sent - before.sent));
     }
     assert!(packages.iter().any(|(received, _)| *received >= 5), "no burst: {packages:?}");
-    assert!(packages.iter().all(|(_, sent)| *sent == 1), "one command a beat, burst or not: {packages:?}");
+    assert!(packages.iter().all(|(_, sent)| *sent == 1), "one command a cycle, burst or not: {packages:?}");
 }
 
 /// The link's own words for what ends it.
@@ -387,7 +391,7 @@ fn kinematics_that_are_not_the_arms_are_noticed_by_the_controllers_own_speed() {
             && cell.cycle.mode().name() != ModeName::Converged
             && cell.now < from + 30_000 * MS
         {
-            cell.beat(None, false);
+            cell.cycle(None, false);
         }
         let code = cell.cycle.mode().fault().map(|f| (f.cause.code(), f.cause.to_string()));
         println!("B17 lengths x {times:<14} {code:?} after {} ms", (cell.now - from) / MS);

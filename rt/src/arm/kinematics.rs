@@ -136,7 +136,7 @@ mod tests {
 
     #[test]
     fn at_zero_the_arm_is_stretched_along_minus_x() {
-        // UR's own picture of the zero pose of a UR5e: flange at (a2+a3, -(d4+d6), d1-d5).
+        // UR's own image of the zero pose of a UR5e: flange at (a2+a3, -(d4+d6), d1-d5).
         let p = Dh::nominal(Model::Ur5e).base_from_flange(&[0.0; 6]).translation.vector;
         assert!((p - Vec3::new(-0.8172, -(0.1333 + 0.0996), 0.1625 - 0.0997)).norm() < 1e-12);
     }

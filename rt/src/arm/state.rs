@@ -1,4 +1,4 @@
-//! What comes from the robot and what goes to it, once a beat.
+//! What comes from the robot and what goes to it, once a cycle.
 
 /// Joint values, base to wrist 3.
 pub type Joints = [f64; 6];
@@ -43,7 +43,7 @@ pub struct RobotState {
     pub digital_outputs: u64,
     /// What the controller says of its own tool point; `None` where its software does not.
     pub tool: Option<ToolPoint>,
-    /// Beat counter echoed by the control script.
+    /// Heartbeat counter echoed by the control script.
     pub echo: i32,
     /// State word of the control script (see `dist/graspd_control.script`).
     pub script_state: i32,
@@ -80,8 +80,8 @@ pub struct ArmCommand {
     pub mode: ArmMode,
     /// Joint rates, rad/s; zero unless `mode` is `Velocity`.
     pub rates: Joints,
-    /// Beat counter, echoed by the script.
-    pub beat: i32,
+    /// Heartbeat counter, echoed by the script.
+    pub heartbeat: i32,
     /// Bits of the gripper's outputs to set (mask in the upper 16 bits, values in the lower 16).
     pub outputs: u32,
 }

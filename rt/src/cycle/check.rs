@@ -15,7 +15,7 @@ const SAMPLES: u32 = 8;
 /// A mark this close to the border does not count, pixels.
 const MARGIN_PX: f64 = 8.0;
 
-/// Whether a set-point can be used at all: finite, and enough marks planned in the pictures in use.
+/// Whether a set-point can be used at all: finite, and enough marks planned in the images in use.
 pub(super) fn setpoint(c: &CycleConfig, s: &SetPoint) -> Result<(), Reject> {
     for goal in [&s.pregrasp, &s.grasp] {
         if goal_points(c, goal, s.best_view)? < c.settings.law.min_points {
@@ -74,7 +74,7 @@ pub(super) fn way(c: &CycleConfig, limits: &Limits, pose: &Pose, q: &Joints, s: 
     Ok(())
 }
 
-/// Marks that face a camera in use and lie inside its picture with the gripper at `pose`.
+/// Marks that face a camera in use and lie inside its image with the gripper at `pose`.
 fn points(c: &CycleConfig, pose: &Pose, best: View) -> u8 {
     let mut n = 0;
     for view in View::BOTH {

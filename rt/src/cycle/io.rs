@@ -1,4 +1,4 @@
-//! What goes into a beat of the command cycle and what comes out of it.
+//! What goes into a cycle of the command cycle and what comes out of it.
 
 use super::grip::Grip;
 use crate::arm::{ArmCommand, Joints, RobotState};
@@ -8,7 +8,7 @@ use crate::mode::{FaultCause, HoldCause, ModeName, Reject};
 use crate::online::Vision;
 use crate::setpoint::SetPoint;
 
-/// The link to the robot as its owner sees it this beat.
+/// The link to the robot as its owner sees it this cycle.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LinkStatus {
     /// Connected, recipes set up, control script started.
@@ -61,7 +61,7 @@ pub struct Request {
     pub kind: RequestKind,
 }
 
-/// The answer to a request, in the same beat.
+/// The answer to a request, in the same cycle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Reply {
     /// The request's number.
@@ -70,16 +70,16 @@ pub struct Reply {
     pub result: Result<(), Reject>,
 }
 
-/// Everything one beat is told.
+/// Everything one cycle is told.
 #[derive(Clone, Copy, Debug)]
 pub struct CommandInput<'a> {
     /// Now, CLOCK_MONOTONIC ns.
     pub now_ns: u64,
-    /// The newest robot state that came since the last beat, if one did.
+    /// The newest robot state that came since the last cycle, if one did.
     pub robot: Option<RobotState>,
     /// The link.
     pub link: LinkStatus,
-    /// The newest vision result since the last beat, if there is one.
+    /// The newest vision result since the last cycle, if there is one.
     pub vision: Option<&'a Vision>,
     /// At most one request; a stop goes before all others.
     pub request: Option<Request>,
@@ -104,7 +104,7 @@ pub enum Stage {
     Retreat = 3,
 }
 
-/// Something that happened in this beat and belongs in the log.
+/// Something that happened in this cycle and belongs in the log.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Transition {
     /// The mode before.
@@ -135,9 +135,9 @@ pub enum Why {
 /// Counts since start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
-    /// Beats run.
-    pub beats: u64,
-    /// Beats missed.
+    /// Cycles run.
+    pub cycles: u64,
+    /// Cycles missed.
     pub overruns: u64,
     /// Vision results used.
     pub frames: u64,
@@ -145,18 +145,18 @@ pub struct Counters {
     pub frames_refused: u64,
     /// Robot states used.
     pub states: u64,
-    /// Beats in which the guard held the motion back.
+    /// Cycles in which the guard held the motion back.
     pub held: u64,
 }
 
-/// What the loop knew and did in one beat: for telemetry, recordings and the fault dump.
+/// What the loop knew and did in one cycle: for telemetry, recordings and the fault dump.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CycleRecord {
     /// When, CLOCK_MONOTONIC ns.
     pub now_ns: u64,
-    /// Real time since the last beat, ns.
+    /// Real time since the last cycle, ns.
     pub dt_ns: u64,
-    /// Mode after the beat.
+    /// Mode after the cycle.
     pub mode: ModeName,
     /// While the arm is not driven: what is wrong with the robot; in a fault, what still would be after a reset.
     pub lasting: Option<FaultCause>,
@@ -166,9 +166,9 @@ pub struct CycleRecord {
     pub probing: bool,
     /// Progress along the present leg, 0 to 1.
     pub progress: f64,
-    /// Sequence number of the picture in use.
+    /// Sequence number of the image in use.
     pub vision_sequence: u64,
-    /// Age of that picture, ns; `u64::MAX` when there is none.
+    /// Age of that image, ns; `u64::MAX` when there is none.
     pub vision_age_ns: u64,
     /// Age of robot state, ns; `u64::MAX` when there is none.
     pub state_age_ns: u64,
@@ -212,7 +212,7 @@ pub struct CycleRecord {
     pub setpoint_id: u64,
 }
 
-/// Everything one beat says.
+/// Everything one cycle says.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CommandOutput {
     /// What goes to the arm.

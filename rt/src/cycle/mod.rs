@@ -1,6 +1,6 @@
-//! One beat of the command thread: newest robot state and pictures in, one set-point out.
+//! One cycle of the command thread: newest robot state and images in, one set-point out.
 //!
-//! A beat gathers facts (`watch_arm`, `watch_vision`), decides (`mode::step`), drives (`servo`) and passes everything through
+//! A cycle gathers facts (`watch_arm`, `watch_vision`), decides (`mode::step`), drives (`servo`) and passes everything through
 //! the guard. It reads no clock and does no IO; the same inputs give the same outputs to the bit.
 
 mod check;
@@ -58,24 +58,24 @@ pub struct CommandCycle {
     best_left_m: f64,
     progress_ns: u64,
     cornered_since_ns: Option<u64>,
-    missed: MissedBeats,
-    broken_beats: u32,
+    missed: MissedCycles,
+    broken_cycles: u32,
     outputs: u32,
-    beat: i32,
+    cycle: i32,
     counters: Counters,
     last_drive: Option<Drive>,
     new_frame: bool,
 }
 
-/// Beats missed in the present and the previous second.
+/// Cycles missed in the present and the previous second.
 #[derive(Clone, Copy, Debug, Default)]
-struct MissedBeats {
+struct MissedCycles {
     second: u64,
     now: u32,
     before: u32,
 }
 
-impl MissedBeats {
+impl MissedCycles {
     fn add(&mut self, now_ns: u64, n: u32) -> u32 {
         let second = now_ns / 1_000_000_000;
         if second != self.second {
@@ -115,10 +115,10 @@ impl CommandCycle {
             best_left_m: f64::INFINITY,
             progress_ns: 0,
             cornered_since_ns: None,
-            missed: MissedBeats::default(),
-            broken_beats: 0,
+            missed: MissedCycles::default(),
+            broken_cycles: 0,
             outputs: 0,
-            beat: 0,
+            cycle: 0,
             counters: Counters::default(),
             last_drive: None,
             new_frame: false,
@@ -136,7 +136,7 @@ impl CommandCycle {
         &self.limits
     }
 
-    /// One beat. Bounded work: at most 64 marks projected a few times each, three 6x6 eigenvalue problems; once per accepted
+    /// One cycle. Bounded work: at most 64 marks projected a few times each, three 6x6 eigenvalue problems; once per accepted
     /// `servo` request, 16 short Newton iterations.
     pub fn step(&mut self, input: &CommandInput) -> CommandOutput {
         let now = input.now_ns;
@@ -144,7 +144,7 @@ impl CommandCycle {
         let dt_ns = self.last_ns.map_or(period, |t| now.saturating_sub(t));
         let back = self.last_ns.is_some_and(|t| now < t);
         self.last_ns = Some(now);
-        self.counters.beats += 1;
+        self.counters.cycles += 1;
         let missed = if dt_ns >= 2 * period { u32::try_from(dt_ns / period - 1).unwrap_or(u32::MAX) } else { 0 };
         self.counters.overruns += u64::from(missed);
         let missed_lately = self.missed.add(now, missed);
@@ -177,7 +177,7 @@ impl CommandCycle {
         let mut held = Held::default();
         let mut scale = 0.0;
         self.last_drive = None;
-        // One step of the guard a beat, whatever happens to the mode after it.
+        // One step of the guard a cycle, whatever happens to the mode after it.
         let mut stepped = false;
         if let (true, Some(q), Some(jacobian)) = (self.mode.drives(), q, jacobian) {
             match self.drive(now, dt_s, &q, &jacobian) {
@@ -216,7 +216,7 @@ impl CommandCycle {
         CommandOutput { command, record, event, reply, setpoint_reply }
     }
 
-    /// Takes robot state and pictures.
+    /// Takes robot state and images.
     fn gather(&mut self, input: &CommandInput) {
         let now = input.now_ns;
         if input.link.connected && !self.arm.connected() {
@@ -268,8 +268,8 @@ impl CommandCycle {
         if !self.mode.drives() {
             return None;
         }
-        if self.broken_beats > 0 {
-            return Some(FaultCause::LawBroken { beats: self.broken_beats });
+        if self.broken_cycles > 0 {
+            return Some(FaultCause::LawBroken { cycles: self.broken_cycles });
         }
         if let Some(astray_m) = self.camera_moved() {
             return Some(FaultCause::CameraMoved { astray_m });
@@ -334,7 +334,7 @@ impl CommandCycle {
             (Action::Changed, Event::Reset { .. }) => {
                 self.arm.clear_events();
                 self.vision.clear_events();
-                self.broken_beats = 0;
+                self.broken_cycles = 0;
                 self.motion = None;
             }
             _ => {}
@@ -427,7 +427,7 @@ impl CommandCycle {
         reduced.min(probe)
     }
 
-    /// The law's beat; without a picture or a way it holds.
+    /// The law's cycle; without an image or a way it holds.
     fn drive(
         &mut self,
         now: u64,
@@ -451,11 +451,11 @@ impl CommandCycle {
         motion.drive(&self.config, seen, q, jacobian, pace, best)
     }
 
-    /// Judges probe, convergence and progress after a beat of the law.
+    /// Judges probe, convergence and progress after a cycle of the law.
     fn after_drive(&mut self, now: u64, d: &Drive, held: Held, q: &Joints, event: &mut Option<Transition>) {
         // The law scales its own rates to the caps, so either of these is a defect of ours.
         if held.has(Held::NOT_FINITE) || held.has(Held::CEILING) {
-            self.broken_beats = self.broken_beats.saturating_add(1);
+            self.broken_cycles = self.broken_cycles.saturating_add(1);
         }
         if let Some(cause) = self.cornered(now, d, held, q) {
             self.apply(Event::Hold(cause), Why::Hold(cause), now, event);
@@ -555,7 +555,7 @@ impl CommandCycle {
     }
 
     fn command(&mut self) -> ArmCommand {
-        self.beat = self.beat.wrapping_add(1);
+        self.cycle = self.cycle.wrapping_add(1);
         let mode = match self.mode {
             Mode::Servoing | Mode::Converged => ArmMode::Velocity,
             Mode::Stopping(_) => ArmMode::Velocity,
@@ -564,7 +564,7 @@ impl CommandCycle {
             Mode::Idle | Mode::Tracking | Mode::Armed | Mode::Fault(_) => ArmMode::Idle,
         };
         let rates = if mode == ArmMode::Velocity { *self.guard.last() } else { [0.0; 6] };
-        ArmCommand { mode, rates, beat: self.beat, outputs: self.outputs }
+        ArmCommand { mode, rates, heartbeat: self.cycle, outputs: self.outputs }
     }
 
     fn record(&self, now: u64, dt_ns: u64, wanted: Joints, held: Held, scale: f64, command: ArmCommand) -> CycleRecord {

@@ -1,7 +1,7 @@
-//! The probe at the start of every motion: slowly, until the pictures show that the gripper goes where it is sent.
+//! The probe at the start of every motion: slowly, until the images show that the gripper goes where it is sent.
 //!
 //! Catches what no configuration check can: an inverted mounting, a wrong model, swapped cameras or a gain of the wrong sign.
-//! It compares what was *intended* (the screws sent, added up) with what was *seen* (the pose from the pictures).
+//! It compares what was *intended* (the screws sent, added up) with what was *seen* (the pose from the images).
 
 use super::settings::WatchSettings;
 use crate::geom::{Pose, Twist, exp_twist, log_pose};
@@ -15,7 +15,7 @@ pub(super) struct Probe {
     /// Where the sent screws should have led, from `start`.
     intended: Pose,
     passed: bool,
-    /// Distance to the goal at the last picture, and how many pictures in a row it grew.
+    /// Distance to the goal at the last image, and how many images in a row it grew.
     left_m: f64,
     grew: u32,
 }
@@ -36,7 +36,7 @@ impl Probe {
         }
     }
 
-    /// Judges by a new picture: the pose it shows, the goal of the leg, and how far it lags (m, unit-scaled).
+    /// Judges by a new image: the pose it shows, the goal of the leg, and how far it lags (m, unit-scaled).
     pub(super) fn judge(
         &mut self,
         seen: &Pose,

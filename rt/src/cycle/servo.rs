@@ -28,7 +28,7 @@ pub(super) struct Motion {
     fade: bool,
 }
 
-/// What one beat of the law found.
+/// What one cycle of the law found.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Drive {
     pub(super) pose: Pose,
@@ -140,9 +140,9 @@ impl Motion {
         stack.solve()
     }
 
-    /// One beat: pose now, correction, screw, joint rates within the speed caps times `share`.
+    /// One cycle: pose now, correction, screw, joint rates within the speed caps times `share`.
     ///
-    /// `scale` slows everything (age of the picture, marks lost), `slider` is what the controller lets through of our rates.
+    /// `scale` slows everything (age of the image, marks lost), `slider` is what the controller lets through of our rates.
     pub(super) fn drive(
         &mut self,
         c: &CycleConfig,
@@ -192,10 +192,10 @@ impl Motion {
     }
 }
 
-/// How fast a beat may go.
+/// How fast a cycle may go.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pace {
-    /// Time since the last beat, seconds, at most one period.
+    /// Time since the last cycle, seconds, at most one period.
     pub(super) dt_s: f64,
     /// Slows everything, 0 to 1.
     pub(super) scale: f64,

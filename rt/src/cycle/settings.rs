@@ -19,11 +19,11 @@ pub struct ConvergeSettings {
     pub noise_factor: f64,
     /// Greatest mark error, pixels rms: a guard against a plan of another rig. Default 12.
     pub error_px: f64,
-    /// Pictures in a row on the grasp. Default 12.
+    /// Images in a row on the grasp. Default 12.
     pub frames: u32,
     /// How much coarser the pre-grasp pose may be passed. Default 4.
     pub pregrasp_factor: f64,
-    /// Pictures in a row on the pre-grasp pose. Default 3.
+    /// Images in a row on the pre-grasp pose. Default 3.
     pub pregrasp_frames: u32,
     /// Times the tolerance at which a converged gripper counts as having left. Default 6.
     pub leave_factor: f64,
@@ -52,11 +52,11 @@ pub struct WatchSettings {
     /// Least share of the controller's states that must come, over one second to two. Default 0.8, as the fault
     /// catalogue has it; below it every delay that the law is tuned for is another one.
     pub state_share: f64,
-    /// Least age of a picture at which the arm is stopped, ns; three frame periods if that is more. Default 100 ms.
+    /// Least age of an image at which the arm is stopped, ns; three frame periods if that is more. Default 100 ms.
     pub frame_age_ns: u64,
     /// Greatest difference of the two eyes' stamps, ns; a quarter of the frame period if that is less. Default 5 ms.
     pub skew_ns: u64,
-    /// Longest time the echoed beat may stand still, ns. Default 50 ms.
+    /// Longest time the echoed heartbeat may stand still, ns. Default 50 ms.
     pub echo_ns: u64,
     /// Longest time set-points may fail to be sent, ns. Default 20 ms.
     pub blocked_ns: u64,
@@ -81,17 +81,17 @@ pub struct WatchSettings {
     pub tool_ns: u64,
     /// How long after the last set-point a joint may still be moving, ns. Default 250 ms.
     pub settle_ns: u64,
-    /// Disagreement of pictures and joints from one picture to the next that is refused, metres (unit-scaled). Default 0.012.
+    /// Disagreement of images and joints from one image to the next that is refused, metres (unit-scaled). Default 0.012.
     pub jump_m: f64,
-    /// Disagreement over six pictures that counts, metres (unit-scaled); or `mismatch_share` of the motion if that is more. Default 0.005.
+    /// Disagreement over six images that counts, metres (unit-scaled); or `mismatch_share` of the motion if that is more. Default 0.005.
     pub mismatch_m: f64,
     /// See `mismatch_m`. Default 0.4.
     pub mismatch_share: f64,
-    /// Pictures in a row with such a disagreement. Default 6.
+    /// Images in a row with such a disagreement. Default 6.
     pub mismatch_frames: u32,
-    /// Missed beats within a second that hold the arm; 0 only counts them (a host without real-time scheduling). Default 5.
+    /// Missed cycles within a second that hold the arm; 0 only counts them (a host without real-time scheduling). Default 5.
     pub overruns_per_s: u32,
-    /// Longest time without a beat, ns. Default 20 ms.
+    /// Longest time without a cycle, ns. Default 20 ms.
     pub stall_ns: u64,
     /// How long data must have been good before a held motion may go on, ns. Default 200 ms.
     pub good_ns: u64,
@@ -101,7 +101,7 @@ pub struct WatchSettings {
     pub probe_share: f64,
     /// Intended motion after which the probe judges, metres (unit-scaled). Default 0.003.
     pub probe_m: f64,
-    /// Share of the intended motion that must be seen in the pictures, and greatest share seen across it. Default 0.4.
+    /// Share of the intended motion that must be seen in the images, and greatest share seen across it. Default 0.4.
     pub probe_agreement: f64,
     /// Motion at which a probe that has not passed is a fault, metres (unit-scaled). Default 0.012.
     pub probe_limit_m: f64,
@@ -143,7 +143,7 @@ impl Default for WatchSettings {
 }
 
 impl WatchSettings {
-    /// For a host without real-time scheduling: missed beats are counted and hold nothing, and robot state, pictures and the
+    /// For a host without real-time scheduling: missed cycles are counted and hold nothing, and robot state, images and the
     /// loop itself may be twice as late. The robot-side watchdog of 50 ms stays what it is.
     pub fn best_effort() -> Self {
         let d = Self::default();
@@ -192,9 +192,9 @@ impl Default for TaskSettings {
 /// All settings of the cycle.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CycleSettings {
-    /// The beat, ns. Default 2 ms.
+    /// The cycle, ns. Default 2 ms.
     pub period_ns: u64,
-    /// Expected time between pictures, ns, until it has been measured. Default 16.7 ms.
+    /// Expected time between images, ns, until it has been measured. Default 16.7 ms.
     pub frame_period_ns: u64,
     /// The law.
     pub law: LawSettings,

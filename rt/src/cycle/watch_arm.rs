@@ -6,7 +6,7 @@ use crate::arm::{Joints, RobotState, ToolPoint};
 use crate::math;
 use crate::mode::FaultCause;
 
-/// Set-points remembered, to compare motion with: 64 beats cover the arm's delay at every beat rate.
+/// Set-points remembered, to compare motion with: 64 cycles cover the arm's delay at every cycle rate.
 const SENT: usize = 64;
 
 /// Safety bits by meaning.
@@ -96,7 +96,7 @@ impl ArmWatch {
         }
     }
 
-    /// Takes this beat's news; returns whether a new, usable state came.
+    /// Takes this cycle's news; returns whether a new, usable state came.
     pub(super) fn observe(&mut self, now_ns: u64, robot: Option<&RobotState>, link: LinkStatus) -> bool {
         if link.connected && !self.link.connected {
             // A new connection: the controller may have been restarted, nothing old is comparable.
@@ -155,7 +155,7 @@ impl ArmWatch {
         None
     }
 
-    /// Notes what was sent in this beat.
+    /// Notes what was sent in this cycle.
     pub(super) fn note_sent(&mut self, now_ns: u64, rates: &Joints) {
         self.sent_at = (self.sent_at + 1) % SENT;
         self.sent[self.sent_at] = (now_ns, *rates);
@@ -228,7 +228,7 @@ impl ArmWatch {
         (self.thin.share < self.settings.state_share).then_some(self.thin.share)
     }
 
-    /// Whether there was a link in the last beat.
+    /// Whether there was a link in the last cycle.
     pub(super) fn connected(&self) -> bool {
         self.link.connected
     }
@@ -321,7 +321,7 @@ impl ArmWatch {
         None
     }
 
-    /// Whether the arm has been fit to be driven for `good_ns`. To be called once a beat.
+    /// Whether the arm has been fit to be driven for `good_ns`. To be called once a cycle.
     pub(super) fn note_good(&mut self, now_ns: u64, watched: bool) {
         self.good_since_ns =
             if self.fault(now_ns, watched).is_none() { self.good_since_ns.or(Some(now_ns)) } else { None };

@@ -1,4 +1,4 @@
-//! Watches the pictures: what may be used, how old it is, and whether it agrees with the joints.
+//! Watches the images: what may be used, how old it is, and whether it agrees with the joints.
 
 use super::settings::WatchSettings;
 use crate::arm::{Dh, Joints};
@@ -9,14 +9,14 @@ use crate::online::rig_watch::RigHealth;
 use crate::online::screw::{LawSettings, ViewMode};
 use crate::online::{Vision, VisionStatus};
 
-/// Pictures over which motion is compared.
+/// Images over which motion is compared.
 const WINDOW: usize = 6;
 
 /// Marks in a view below which it adds no depth, and results in a row after which that is no passing hand (80 ms at 60 Hz).
 const VIEW_MARKS: u8 = 3;
 const ONE_VIEW_RESULTS: u32 = 5;
 
-/// A vision result in use, and where the joints were when its pictures were taken.
+/// A vision result in use, and where the joints were when its images were taken.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Seen {
     pub(super) vision: Vision,
@@ -36,13 +36,13 @@ fn middle(c: &[u64; 2]) -> u64 {
     c[0] / 2 + c[1] / 2 + (c[0] & c[1] & 1)
 }
 
-/// The pictures as known now.
+/// The images as known now.
 #[derive(Clone, Debug)]
 pub(super) struct VisionWatch {
     settings: WatchSettings,
     law: LawSettings,
     seen: Option<Seen>,
-    /// Pose and joints of the last pictures, newest at `at`.
+    /// Pose and joints of the last images, newest at `at`.
     track: [Option<(Pose, Joints)>; WINDOW],
     at: usize,
     period_ns: u64,
@@ -162,7 +162,7 @@ impl VisionWatch {
         Taken::Used
     }
 
-    /// Compares the motion over the last pictures with the joints' own.
+    /// Compares the motion over the last images with the joints' own.
     fn compare_motion(&mut self, pose: &Pose, q: &Joints, dh: &Dh, mount: &Pose, driven: bool) {
         if !driven {
             self.track = [None; WINDOW];
@@ -197,7 +197,7 @@ impl VisionWatch {
         self.one_view >= ONE_VIEW_RESULTS
     }
 
-    /// Age of the picture in use, ns.
+    /// Age of the image in use, ns.
     pub(super) fn age_ns(&self, now_ns: u64) -> u64 {
         self.seen.map_or(u64::MAX, |s| now_ns.saturating_sub(s.capture_ns()))
     }
@@ -207,10 +207,10 @@ impl VisionWatch {
         (3 * self.period_ns).max(self.settings.frame_age_ns)
     }
 
-    /// Speed share for the age of the picture and the marks it shows: 1 while fresh, 0 at the limit.
+    /// Speed share for the age of the image and the marks it shows: 1 while fresh, 0 at the limit.
     pub(super) fn scale(&self, now_ns: u64) -> f64 {
         let (age, limit) = (self.age_ns(now_ns), self.limit_ns());
-        // Fresh is: two periods more than the pictures usually take to arrive.
+        // Fresh is: two periods more than the images usually take to arrive.
         let hold = (self.delay_ns + 2 * self.period_ns).min(limit * 3 / 4);
         let by_age = if age <= hold {
             1.0

@@ -26,7 +26,7 @@ pub enum CameraError {
     FocalLength,
     /// The image has no pixels, or more than 65 535 on a side.
     ImageSize,
-    /// The distortion model folds the picture over itself inside the image, so that a pixel has no unique ray.
+    /// The distortion model folds the image over itself inside the image, so that a pixel has no unique ray.
     Folds,
 }
 
@@ -50,7 +50,7 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// Checks every parameter, and that the lens model is invertible over the whole picture.
+    /// Checks every parameter, and that the lens model is invertible over the whole image.
     pub fn validated(self) -> Result<Self, CameraError> {
         let d = &self.distortion;
         let all = [self.fx, self.fy, self.cx, self.cy, d.k1, d.k2, d.p1, d.p2, d.k3, d.k4, d.k5, d.k6];
@@ -163,7 +163,7 @@ impl Camera {
         self.undistort(p).map(|n| Vec3::new(n.x, n.y, 1.0).normalize())
     }
 
-    /// Whether a pixel lies inside the picture by at least `margin` pixels.
+    /// Whether a pixel lies inside the image by at least `margin` pixels.
     pub fn contains(&self, p: Pixel, margin: f64) -> bool {
         p.x >= margin
             && p.y >= margin
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn undistort_inverts_distort_over_the_whole_picture() {
+    fn undistort_inverts_distort_over_the_whole_image() {
         let c = cam().validated().unwrap();
         for j in 0..=20 {
             for i in 0..=20 {

@@ -35,7 +35,7 @@ pub struct StopFigures {
     pub tcp_m: f64,
 }
 
-/// The longest jerk filter, beats: bounds its memory, and how late it may make a stop.
+/// The longest jerk filter, cycles: bounds its memory, and how late it may make a stop.
 pub const MAX_FILTER: usize = 32;
 
 /// Limits of the motion. All are kept by slowing the whole motion, so that its direction stays.
@@ -105,7 +105,7 @@ pub struct Limits {
 }
 
 impl Limits {
-    /// Checks settings for a model and a beat of `period_ns`.
+    /// Checks settings for a model and a cycle of `period_ns`.
     ///
     /// # Errors
     /// [`LimitError`] names the key, its value and its range.
@@ -121,7 +121,7 @@ impl Limits {
         let filter = if settings.jerk_rad_per_s3 == 0.0 {
             1
         } else {
-            // A mean over n beats of a motion within A has a jerk within 2 A / (n T).
+            // A mean over n cycles of a motion within A has a jerk within 2 A / (n T).
             let least = 2.0 * settings.acceleration_rad_per_s2 / (MAX_FILTER as f64 * period_s);
             within("jerk_rad_per_s3", settings.jerk_rad_per_s3, least, 1e6)?;
             let n = 2.0 * settings.acceleration_rad_per_s2 / (settings.jerk_rad_per_s3 * period_s);
@@ -159,13 +159,13 @@ impl Limits {
         Ok(limits)
     }
 
-    /// The guard's own stop from full speed, to the beat: the rates shrink by A T a beat, N beats long, and the mean
-    /// over the last n beats, which begins full of the old rates, follows it by (n - 1) / 2 beats and ends n - 1 beats
+    /// The guard's own stop from full speed, to the cycle: the rates shrink by A T a cycle, N cycles long, and the mean
+    /// over the last n cycles, which begins full of the old rates, follows it by (n - 1) / 2 cycles and ends n - 1 cycles
     /// later.
     pub fn stop_figures(&self) -> StopFigures {
         let fastest = self.velocity.iter().fold(0.0_f64, |m, v| m.max(*v));
         let (step, lag) = (self.acceleration * self.period_s, self.filter as f64 - 1.0);
-        // Beats of the ramp, the last of which is rest.
+        // Cycles of the ramp, the last of which is rest.
         let n = crate::math::ceil(fastest / step - 1e-9).max(1.0);
         let ramp = (n - 1.0) * fastest - step * (n - 1.0) * n * 0.5;
         let joint_rad = self.period_s * (ramp + fastest * lag * 0.5);
@@ -192,7 +192,7 @@ impl Limits {
         (self.min, self.max)
     }
 
-    /// Longest time a stop takes on the wire, nanoseconds, with a beat to spare for one that comes late.
+    /// Longest time a stop takes on the wire, nanoseconds, with a cycle to spare for one that comes late.
     pub fn ramp_ns(&self) -> u64 {
         ((self.stop_figures().time_s + self.period_s) * 1e9) as u64
     }
@@ -212,7 +212,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn defaults_hold_for_every_model_and_beat() {
+    fn defaults_hold_for_every_model_and_cycle() {
         for model in Model::ALL {
             for period in [1_000_000, 2_000_000, 8_000_000, 20_000_000] {
                 let l = Limits::new(&LimitSettings::default(), model, period).unwrap();
@@ -237,9 +237,9 @@ mod tests {
         assert_eq!(Limits::new(&d, Model::Ur5e, 1).unwrap_err().key, "period_s");
     }
 
-    /// What the formula says is what the guard does, from full speed of one joint and of all, at every beat.
+    /// What the formula says is what the guard does, from full speed of one joint and of all, at every cycle.
     #[test]
-    fn the_stop_is_the_guards_own_to_the_beat() {
+    fn the_stop_is_the_guards_own_to_the_cycle() {
         use crate::guard::Guard;
         let d = LimitSettings::default();
         let jerk = |jerk_rad_per_s3| LimitSettings { jerk_rad_per_s3, ..d };
@@ -258,13 +258,13 @@ mod tests {
                     guard.step(&wanted, &[0.0; 6], &still, 1.0, dt);
                 }
                 assert!((guard.last()[0] - fastest).abs() < 1e-9, "{settings:?}: not at full speed");
-                let (mut beats, mut way) = (0, 0.0);
+                let (mut cycles, mut way) = (0, 0.0);
                 while !guard.at_rest() {
                     let sent = guard.stop(dt).rates;
-                    (beats, way) = (beats + 1, way + sent[0] * dt);
+                    (cycles, way) = (cycles + 1, way + sent[0] * dt);
                 }
                 let f = limits.stop_figures();
-                assert!((f.time_s - f64::from(beats) * dt).abs() < 1e-9, "{settings:?} {period_ns}: {beats} {f:?}");
+                assert!((f.time_s - f64::from(cycles) * dt).abs() < 1e-9, "{settings:?} {period_ns}: {cycles} {f:?}");
                 assert!((f.joint_rad - way).abs() < 1e-9, "{settings:?} {period_ns}: {way} {f:?}");
                 assert!((f.tcp_m - limits.tcp_speed * way / fastest).abs() < 1e-9);
             }

@@ -202,7 +202,7 @@ impl Guard {
         if scale.is_finite() { scale.clamp(0.0, 1.0) } else { 0.0 }
     }
 
-    /// Time at full speed before a stop takes hold: the arm's own reaction, a beat each way, the filter's delay.
+    /// Time at full speed before a stop takes hold: the arm's own reaction, a cycle each way, the filter's delay.
     fn dead_s(&self) -> f64 {
         self.limits.reaction_s + self.limits.period_s * (2.0 + 0.5 * self.limits.filter as f64)
     }

@@ -1,9 +1,9 @@
-//! Camera formats into the mono8 picture that tracking reads.
+//! Camera formats into the mono8 image that tracking reads.
 //!
 //! Each function writes a caller's buffer of `width * height` bytes without padding, so that its result is read with
-//! `ImageView::new(out, width, height, width)`. The work is one pass over the picture; nothing is allocated.
+//! `ImageView::new(out, width, height, width)`. The work is one pass over the image; nothing is allocated.
 
-/// Why a picture cannot be converted.
+/// Why an image cannot be converted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ConvertError {
     /// The source has fewer bytes than width, height and stride say.

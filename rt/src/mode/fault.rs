@@ -9,7 +9,7 @@ use core::fmt;
 pub enum FaultCause {
     /// F-CAM-01: no usable stereo pair for too long.
     FramesStale {
-        /// Age of the newest result's picture, ns.
+        /// Age of the newest result's image, ns.
         age_ns: u64,
         /// Greatest allowed age, ns.
         limit_ns: u64,
@@ -31,7 +31,7 @@ pub enum FaultCause {
         /// How far that leads the gripper astray, metres (unit-scaled).
         astray_m: f64,
     },
-    /// F-MRK-02: the pictures and the joints disagree about the motion (frozen picture, wrong camera, slipping mount).
+    /// F-MRK-02: the images and the joints disagree about the motion (frozen image, wrong camera, slipping mount).
     MotionMismatch {
         /// Motion by the joints over the window, metres (unit-scaled).
         joints_m: f64,
@@ -47,8 +47,8 @@ pub enum FaultCause {
     },
     /// F-LAW-02: the law's own numbers are not finite, or were far above its caps for long.
     LawBroken {
-        /// Beats with such numbers in the last second.
-        beats: u32,
+        /// Cycles with such numbers in the last second.
+        cycles: u32,
     },
     /// F-ARM-01: the link to the robot is lost.
     LinkLost,
@@ -59,7 +59,7 @@ pub enum FaultCause {
         /// Greatest allowed age, ns.
         limit_ns: u64,
     },
-    /// F-ARM-03: our set-points do not arrive: the beat echoed by the control script stands still.
+    /// F-ARM-03: our set-points do not arrive: the heartbeat echoed by the control script stopped.
     EchoStopped {
         /// How long, ns.
         for_ns: u64,
@@ -205,12 +205,12 @@ impl fmt::Display for FaultCause {
         match self {
             FaultCause::FramesStale { age_ns, limit_ns } => write!(
                 f,
-                "the newest usable picture is {:.0} ms old (limit {:.0} ms): check the cameras",
+                "the newest usable image is {:.0} ms old (limit {:.0} ms): check the cameras",
                 ms(age_ns),
                 ms(limit_ns)
             ),
             FaultCause::FrameStamps { count } => {
-                write!(f, "{count} pictures in a row with impossible time stamps: check the camera driver's clock")
+                write!(f, "{count} images in a row with impossible time stamps: check the camera driver's clock")
             }
             FaultCause::CameraMoved { astray_m } => write!(
                 f,
@@ -225,7 +225,7 @@ impl fmt::Display for FaultCause {
             ),
             FaultCause::MotionMismatch { joints_m, difference_m } => write!(
                 f,
-                "the arm moved by {:.1} mm and the pictures disagree by {:.1} mm: a picture stands still, or the gripper's mounting is wrong",
+                "the arm moved by {:.1} mm and the images disagree by {:.1} mm: an image stands still, or the gripper's mounting is wrong",
                 joints_m * 1e3,
                 difference_m * 1e3
             ),
@@ -234,8 +234,8 @@ impl fmt::Display for FaultCause {
                 "the gripper does not go where it is sent (agreement {agreement:.2} after {:.1} mm): check flange_from_gripper, the arm's model and the marks",
                 moved_m * 1e3
             ),
-            FaultCause::LawBroken { beats } => {
-                write!(f, "the law gave unusable numbers in {beats} beats of one second")
+            FaultCause::LawBroken { cycles } => {
+                write!(f, "the law gave unusable numbers in {cycles} cycles of one second")
             }
             FaultCause::LinkLost => write!(f, "the link to the robot is lost"),
             FaultCause::StateStale { age_ns, limit_ns } => {
@@ -288,12 +288,12 @@ pub enum HoldCause {
     MarksLost,
     /// H-10: the law got fewer image points than it needs.
     FewPoints {
-        /// Image points in the pictures in use (a mark in one view is one).
+        /// Image points in the images in use (a mark in one view is one).
         points: u8,
         /// Points needed.
         needed: u8,
     },
-    /// H-11: the law found no finite solution in this beat.
+    /// H-11: the law found no finite solution in this cycle.
     NoSolution,
     /// H-15: the controller leaves out too many of its states (R11).
     StatesMissing {
@@ -328,12 +328,12 @@ pub enum HoldCause {
     },
     /// H-06: the speed slider is at zero (B05).
     SliderZero,
-    /// H-07: beats were missed too often (T02).
+    /// H-07: cycles were missed too often (T02).
     Overruns {
-        /// Beats missed in the last second.
+        /// Cycles missed in the last second.
         count: u32,
     },
-    /// H-08: pictures of the two eyes are too far apart in time (C06).
+    /// H-08: images of the two eyes are too far apart in time (C06).
     Skew {
         /// Difference, ns.
         skew_ns: u64,
@@ -377,7 +377,7 @@ impl fmt::Display for HoldCause {
             HoldCause::MarksLost => write!(f, "the marks are not seen: clear the view, then servo again"),
             HoldCause::FewPoints { points, needed } => write!(
                 f,
-                "only {points} marks are seen in the pictures in use, {needed} are needed: clear the view, then servo again"
+                "only {points} marks are seen in the images in use, {needed} are needed: clear the view, then servo again"
             ),
             HoldCause::CameraSuspect => write!(
                 f,
@@ -408,9 +408,9 @@ impl fmt::Display for HoldCause {
             }
             HoldCause::NoProgress { left_m } => write!(f, "no progress with {:.2} mm left", left_m * 1e3),
             HoldCause::SliderZero => write!(f, "the speed slider is at zero"),
-            HoldCause::Overruns { count } => write!(f, "{count} beats were missed within one second"),
+            HoldCause::Overruns { count } => write!(f, "{count} cycles were missed within one second"),
             HoldCause::Skew { skew_ns } => {
-                write!(f, "the two eyes' pictures are {:.1} ms apart", *skew_ns as f64 * 1e-6)
+                write!(f, "the two eyes' images are {:.1} ms apart", *skew_ns as f64 * 1e-6)
             }
             HoldCause::LeaseLost => write!(f, "the operator's lease ran out"),
         }
@@ -436,7 +436,7 @@ pub enum Reject {
     BadSetPoint,
     /// The goal, or the way to it, is out of the arm's reach or range.
     OutOfReach,
-    /// Too few marks stay in the pictures on the way.
+    /// Too few marks stay in the images on the way.
     PathLeavesView,
     /// Data has not been good for long enough since the hold.
     Settling,
@@ -458,14 +458,14 @@ impl Reject {
         match self {
             Reject::WrongMode => "not possible in this mode",
             Reject::NoSetPoint => "no set-point is loaded: send a plan first",
-            Reject::NoMarks => "the marks are not tracked: check the pictures and the gripper file",
+            Reject::NoMarks => "the marks are not tracked: check the images and the gripper file",
             Reject::RobotNotReady => "the robot is not ready: power on, release the brakes, start the control script",
             Reject::CausePresent => "the cause of the fault is still there",
             Reject::Moving => "the set-point cannot change while the arm moves: stop first",
             Reject::BadSetPoint => "the set-point is incomplete or shows too few marks",
             Reject::OutOfReach => "the goal or the way to it is out of the arm's reach: move the part or the arm",
-            Reject::PathLeavesView => "too few marks stay in the pictures on the way: move the arm closer or the rig",
-            Reject::Settling => "wait until pictures and robot state have been good for 200 ms",
+            Reject::PathLeavesView => "too few marks stay in the images on the way: move the arm closer or the rig",
+            Reject::Settling => "wait until images and robot state have been good for 200 ms",
             Reject::CameraMoved => {
                 "a camera was moved since the set-point was given: check the calibration, take new images and plan again"
             }
@@ -496,7 +496,7 @@ mod tests {
             FaultCause::MarksJumped { jump_m: 0.0, limit_m: 0.0 },
             FaultCause::MotionMismatch { joints_m: 0.0, difference_m: 0.0 },
             FaultCause::WrongWay { agreement: 0.0, moved_m: 0.0 },
-            FaultCause::LawBroken { beats: 0 },
+            FaultCause::LawBroken { cycles: 0 },
             FaultCause::LinkLost,
             FaultCause::StateStale { age_ns: 0, limit_ns: 0 },
             FaultCause::EchoStopped { for_ns: 0 },

@@ -1,4 +1,4 @@
-//! Two cheap looks at a picture's content: is it the same picture again, and is it exposed at all.
+//! Two cheap looks at an image's content: is it the same image again, and is it exposed at all.
 
 use super::StereoFrame;
 use super::pose::MarkTable;
@@ -6,11 +6,11 @@ use crate::geom::View;
 use crate::gripper::MAX_MARKS;
 use crate::image::ImageView;
 
-/// Detects a picture that repeats byte by byte while its sequence number counts (fault C03).
+/// Detects an image that repeats byte by byte while its sequence number counts (fault C03).
 ///
 /// A few rows about each mark are hashed *where the marks were when the content last changed*: were the windows to follow the
-/// prediction, a moving arm would make a frozen picture look new. A live camera's noise changes the hash at every frame, so
-/// that a run of equal ones says that the picture is frozen; whether that is a fault (the arm moves) the command side decides.
+/// prediction, a moving arm would make a frozen image look new. A live camera's noise changes the hash at every frame, so
+/// that a run of equal ones says that the image is frozen; whether that is a fault (the arm moves) the command side decides.
 #[derive(Clone, Debug)]
 pub(crate) struct FreezeWatch {
     anchors: [[Option<(u16, u16)>; MAX_MARKS]; 2],
@@ -67,7 +67,7 @@ impl FreezeWatch {
     }
 }
 
-/// Whether a picture is black, saturated, or without contrast (fault C12), from about a thousand of its pixels.
+/// Whether an image is black, saturated, or without contrast (fault C12), from about a thousand of its pixels.
 pub(crate) fn badly_exposed(image: &ImageView<'_>, min_contrast: f64) -> bool {
     const SIDE: usize = 32;
     let (mut black, mut white, mut low, mut high) = (0_u32, 0_u32, 255_u8, 0_u8);
@@ -82,6 +82,6 @@ pub(crate) fn badly_exposed(image: &ImageView<'_>, min_contrast: f64) -> bool {
         }
     }
     let all = (SIDE * SIDE) as u32;
-    // A dark room behind the part is no fault, hence nearly all for black; half of a picture burnt out is one.
+    // A dark room behind the part is no fault, hence nearly all for black; half of an image burnt out is one.
     black * 20 > all * 19 || white * 2 > all || f64::from(high.saturating_sub(low)) < min_contrast
 }

@@ -6,20 +6,20 @@ use crate::image::ImageView;
 /// A stereo pair, borrowed for the time of one step.
 #[derive(Clone, Copy, Debug)]
 pub struct StereoFrame<'a> {
-    /// The left picture.
+    /// The left image.
     pub left: ImageView<'a>,
-    /// The right picture.
+    /// The right image.
     pub right: ImageView<'a>,
     /// The publisher's sequence number.
     pub sequence: u64,
-    /// When each eye's picture was taken (mid-exposure), CLOCK_MONOTONIC nanoseconds.
+    /// When each eye's image was taken (mid-exposure), CLOCK_MONOTONIC nanoseconds.
     pub capture_ns: [u64; 2],
     /// The time now, CLOCK_MONOTONIC nanoseconds.
     pub now_ns: u64,
 }
 
 impl<'a> StereoFrame<'a> {
-    /// The picture of a view.
+    /// The image of a view.
     pub fn image(&self, view: View) -> &ImageView<'a> {
         match view {
             View::Left => &self.left,
@@ -48,7 +48,7 @@ impl Default for FrameLimits {
 /// Why a stereo pair was refused; the fault catalogue's numbers are in brackets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FrameReject {
-    /// A picture has not the size of the rig's camera \[C08\].
+    /// An image has not the size of the rig's camera \[C08\].
     Size {
         /// Which view.
         view: View,

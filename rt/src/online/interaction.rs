@@ -44,7 +44,7 @@ impl<'a> PlacedView<'a> {
         (self.rotation * normal).dot(&x) < 0.0
     }
 
-    /// Whether a pixel lies inside the picture by `margin` pixels.
+    /// Whether a pixel lies inside the image by `margin` pixels.
     pub fn contains(&self, pixel: Pixel, margin: f64) -> bool {
         self.camera.contains(pixel, margin)
     }

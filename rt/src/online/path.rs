@@ -1,7 +1,7 @@
-//! The path of the reference: from where the gripper is to where it shall be, in space, seen in the pictures.
+//! The path of the reference: from where the gripper is to where it shall be, in space, seen in the images.
 //!
 //! The servo never chases a far goal. A reference pose moves along a leg (straight line with an even turn, or an arc round the
-//! valve's axis), the marks' pictures of that pose are the servo's reference features, and its velocity is fed forward. When the
+//! valve's axis), the marks' images of that pose are the servo's reference features, and its velocity is fed forward. When the
 //! gripper lags, the reference waits. At the end of a leg the reference features *are* the plan's own pixels.
 
 use crate::geom::{Pixel, Pose, Twist, Vec3, exp_twist, log_pose};
@@ -193,7 +193,7 @@ pub fn blend(s: f64) -> f64 {
     s * s * (3.0 - 2.0 * s)
 }
 
-/// Reference pixel of a mark: the picture of the reference pose, and the plan's own offset carried along.
+/// Reference pixel of a mark: the image of the reference pose, and the plan's own offset carried along.
 ///
 /// `from` and `to` are what the plan's pixels differ by from the projection of their pose at the leg's start and end; at
 /// `s = 1`, with the reference on the goal pose, the result is the plan's pixel.

@@ -1,6 +1,6 @@
-//! Prediction from the instant of the picture to now, by the arm's own encoders.
+//! Prediction from the instant of the image to now, by the arm's own encoders.
 //!
-//! The picture is tens of milliseconds old when its marks are known. Between its capture and now the gripper moved as the
+//! The image is tens of milliseconds old when its marks are known. Between its capture and now the gripper moved as the
 //! joints say, in its own frame; the rig's place relative to the robot cancels and appears nowhere. An error of the arm model
 //! scales with that short motion and vanishes at rest, so it cannot shift where the servo ends.
 

@@ -1,4 +1,4 @@
-//! The law: from mark errors in the pictures to the gripper's correction and velocity screw.
+//! The law: from mark errors in the images to the gripper's correction and velocity screw.
 //!
 //! All marks of the views in use are stacked: four rows a mark in stereo, two in one view. The stack is never stored; each mark
 //! adds its part to the weighted normal equations, so that 32 marks in two views cost 64 small products and one 6x6 solve.
@@ -8,17 +8,17 @@ use crate::geom::{Pixel, Twist, Vec3, View};
 use crate::math;
 use nalgebra::{Matrix2, Matrix6, SymmetricEigen, Vector6};
 
-/// Which pictures close the loop.
+/// Which images close the loop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub enum ViewMode {
     /// Both, stacked: cancels calibration errors in depth as well.
     #[default]
     Stereo,
-    /// The left picture only.
+    /// The left image only.
     Left,
-    /// The right picture only.
+    /// The right image only.
     Right,
-    /// The paper's mode: the one picture that the plan found to show the marks best.
+    /// The paper's mode: the one image that the plan found to show the marks best.
     Best,
 }
 
@@ -49,7 +49,7 @@ pub enum JacobianAt {
 /// Settings of the law.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LawSettings {
-    /// Pictures in use. Default: stereo.
+    /// Images in use. Default: stereo.
     pub views: ViewMode,
     /// Where the Jacobian is taken. Default: mean.
     pub jacobian: JacobianAt,

@@ -8,7 +8,7 @@ use nalgebra::{Matrix2, Matrix6};
 /// One mark seen in one view.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MarkObservation {
-    /// Picture of the disc's centre, pixels with lens distortion; the perspective bias of the disc's centroid is already removed.
+    /// Image of the disc's centre, pixels with lens distortion; the perspective bias of the disc's centroid is already removed.
     pub pixel: Pixel,
     /// Covariance of `pixel`, px².
     pub covariance: Matrix2<f64>,
@@ -32,7 +32,7 @@ pub enum VisionStatus {
 pub struct Vision {
     /// Sequence number of the pair, from the publisher.
     pub sequence: u64,
-    /// When each eye's picture was taken (mid-exposure), CLOCK_MONOTONIC nanoseconds.
+    /// When each eye's image was taken (mid-exposure), CLOCK_MONOTONIC nanoseconds.
     pub capture_ns: [u64; 2],
     /// Whether this result may be used.
     pub status: VisionStatus,

@@ -1,6 +1,6 @@
 //! One frame after another into gripper poses: predict, measure, solve, look again where it paid, judge.
 //!
-//! The cycle owns everything that is remembered between frames. It never searches the whole picture: when the marks
+//! The cycle owns everything that is remembered between frames. It never searches the whole image: when the marks
 //! are lost it says so, and an acquisition (see [`super::acquire`]) done elsewhere hands its pose to
 //! [`VisionCycle::seed`].
 
@@ -67,7 +67,7 @@ impl Default for VisionSettings {
 /// What the last frame said about the cameras, beside the pose.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct VisionHealth {
-    /// Frames in a row whose mark windows were byte for byte those of the frame before: a frozen picture, if the arm
+    /// Frames in a row whose mark windows were byte for byte those of the frame before: a frozen image, if the arm
     /// moves \[C03\].
     pub frozen_run: u32,
     /// Whether each view is black, saturated or without contrast \[C12\].
@@ -375,7 +375,7 @@ impl VisionCycle {
         }
     }
 
-    /// Full speed needs, in each view, four marks that will still be in the picture three frames on, and half of
+    /// Full speed needs, in each view, four marks that will still be in the image three frames on, and half of
     /// those that face it.
     fn judge(&mut self, e: &PoseEstimate, velocity: &Twist) -> VisionStatus {
         let soon = e.left_from_gripper * exp_twist(&(velocity * 0.1));

@@ -9,7 +9,7 @@
 //!    [`Slot`] the resolved place of one value.
 //! 4. [`Session`] is the client's half of the conversation: what to send next, and what an answer means.
 //! 5. [`StateReader`] and [`CommandWriter`] are graspd's own recipes; [`GapMeter`] counts what the controller left out,
-//!    and [`PhaseLock`] lets a beat follow the controller's.
+//!    and [`PhaseLock`] lets a cycle follow the controller's.
 //!
 //! All numbers are big-endian. A server is written with the same pieces as a client:
 //!

@@ -203,7 +203,7 @@ impl CommandWriter {
         let mut body = [0u8; Self::PACKAGE - 3];
         body[0] = self.recipe;
         let values = &mut body[1..];
-        for (i, word) in [mode, command.beat, self.token, command.outputs as i32].into_iter().enumerate() {
+        for (i, word) in [mode, command.heartbeat, self.token, command.outputs as i32].into_iter().enumerate() {
             word.write(values, 4 * i);
         }
         rates.write(values, 16);

@@ -1,4 +1,4 @@
-//! Counts this thread's use of the heap: the core cannot allocate by construction, and this shows it on every beat of every test.
+//! Counts this thread's use of the heap: the core cannot allocate by construction, and this shows it on every cycle of every test.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;

@@ -26,7 +26,7 @@ fn run(w: &mut World, tracking: bool, wait_ms: u64, knock: Option<(View, Twist)>
     // The part stays where it is, in the base.
     let base_from_aim = w.base_from_left * w.aim;
     w.run(500);
-    assert_eq!(w.beat(None, true).setpoint_reply, Some(Ok(())));
+    assert_eq!(w.cycle(None, true).setpoint_reply, Some(Ok(())));
     let mut end = End { converged_mm: None, warned: false, moves: 0, shakes: 0, evidence: [0.0; 2], after_ms: None };
     let mut knocked_at = None;
     if tracking {
@@ -37,8 +37,8 @@ fn run(w: &mut World, tracking: bool, wait_ms: u64, knock: Option<(View, Twist)>
         }
         w.run(300);
     }
-    let armed = w.beat(Some(RequestKind::Arm), false).reply.unwrap().result;
-    let begun = armed.and_then(|()| w.beat(Some(RequestKind::Servo), false).reply.unwrap().result);
+    let armed = w.cycle(Some(RequestKind::Arm), false).reply.unwrap().result;
+    let begun = armed.and_then(|()| w.cycle(Some(RequestKind::Servo), false).reply.unwrap().result);
     let note = |w: &World, end: &mut End, knocked_at: Option<u64>| {
         let rig = w.watch.health();
         (end.moves, end.shakes) = (rig.moves, rig.shakes);
@@ -62,7 +62,7 @@ fn run(w: &mut World, tracking: bool, wait_ms: u64, knock: Option<(View, Twist)>
             }
             knocked_at = Some(w.now);
         }
-        let out = w.beat(None, false);
+        let out = w.cycle(None, false);
         note(w, &mut end, knocked_at);
         match out.record.mode {
             ModeName::Converged => settled += 1,
@@ -173,15 +173,15 @@ fn a_plan_from_before_the_knock_is_refused_until_there_is_a_new_one() {
         assert_eq!(w.watch.health().moves, 1, "seed {seed}");
         assert!(!w.watch.health().suspicious);
         for _ in 0..3 {
-            let out = w.beat(Some(RequestKind::Servo), false);
+            let out = w.cycle(Some(RequestKind::Servo), false);
             assert_eq!(out.reply.unwrap().result, Err(Reject::CameraMoved), "seed {seed}");
             w.run(300);
         }
-        w.beat(Some(RequestKind::Disarm), false);
-        assert_eq!(w.beat(Some(RequestKind::Arm), false).reply.unwrap().result, Err(Reject::CameraMoved));
+        w.cycle(Some(RequestKind::Disarm), false);
+        assert_eq!(w.cycle(Some(RequestKind::Arm), false).reply.unwrap().result, Err(Reject::CameraMoved));
         // A plan made with the camera where it is now is another matter.
-        assert_eq!(w.beat(None, true).setpoint_reply, Some(Ok(())));
-        assert_eq!(w.beat(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()), "seed {seed}");
+        assert_eq!(w.cycle(None, true).setpoint_reply, Some(Ok(())));
+        assert_eq!(w.cycle(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()), "seed {seed}");
         assert_eq!(w.watch.health().moves, 1, "seed {seed}");
     }
 }
@@ -211,10 +211,10 @@ fn stereo_that_became_one_view_is_not_driven() {
     w.faults.one_view = true;
     let out = w.run(600);
     assert_eq!(out.record.mode, ModeName::Armed);
-    assert_eq!(w.beat(Some(RequestKind::Servo), false).reply.unwrap().result, Err(Reject::OneView));
+    assert_eq!(w.cycle(Some(RequestKind::Servo), false).reply.unwrap().result, Err(Reject::OneView));
     w.faults.one_view = false;
     w.run(500);
-    assert_eq!(w.beat(Some(RequestKind::Servo), false).reply.unwrap().result, Ok(()));
+    assert_eq!(w.cycle(Some(RequestKind::Servo), false).reply.unwrap().result, Ok(()));
 
     let one = |s: &mut CycleSettings| s.law.views = ViewMode::Left;
     let mut w = World::new(33, one);

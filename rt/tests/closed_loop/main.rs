@@ -18,7 +18,7 @@ fn converge(w: &mut World, limit_s: u64) -> Option<f64> {
     w.start();
     let begin = w.now;
     while w.now < begin + limit_s * 1_000 * MS {
-        let out = w.beat(None, false);
+        let out = w.cycle(None, false);
         if let Some(e) = out.event.filter(|e| e.to != ModeName::Converged) {
             println!("{e:?} left {:?}", w.error_to(&w.setpoint.grasp.left_from_gripper));
             return None;
@@ -64,9 +64,9 @@ fn the_wrong_way_is_noticed_by_the_probe() {
                 w.cycle = CommandCycle::new(config).unwrap();
             }
             w.run(500);
-            w.beat(None, true);
-            w.beat(Some(RequestKind::Arm), false);
-            let started = w.beat(Some(RequestKind::Servo), false).reply.unwrap().result;
+            w.cycle(None, true);
+            w.cycle(Some(RequestKind::Arm), false);
+            let started = w.cycle(Some(RequestKind::Servo), false).reply.unwrap().result;
             if started.is_err() {
                 // A mounting so wrong that the way is out of reach is refused before anything moves.
                 assert_eq!(kind, 1, "seed {seed}: {started:?}");
@@ -75,7 +75,7 @@ fn the_wrong_way_is_noticed_by_the_probe() {
             let start = w.left_from_gripper();
             let mut fault = None;
             for _ in 0..2_000 {
-                let out = w.beat(None, false);
+                let out = w.cycle(None, false);
                 fault = fault.or(w.cycle.mode().fault().copied());
                 // How far from the straight way: a mounting that is wrong across the approach is right along it.
                 let way = w.setpoint.pregrasp.left_from_gripper.translation.vector - start.translation.vector;
@@ -149,7 +149,7 @@ fn any_fault_at_any_instant_ends_at_rest() {
             let mut named = None;
             let limit = injected + bound_ms * MS + w.cycle.limits().ramp_ns() + 4 * MS;
             while w.now < limit {
-                let out = w.beat(None, false);
+                let out = w.cycle(None, false);
                 let cause = out.event.map(|e| e.why).filter(|why| matches!(why, Why::Fault(_) | Why::Hold(_)));
                 named = named.or(cause.map(|why| (why, w.now - injected)));
                 w.faults.stall = false;
@@ -170,14 +170,14 @@ fn any_fault_at_any_instant_ends_at_rest() {
             assert!(w.sent[from..].iter().all(|s| s.1 == [0.0; 6]), "{code} moved again by itself");
             if latched {
                 assert_eq!(w.cycle.mode().fault().unwrap().cause.code(), code, "the first cause is kept");
-                let servo = w.beat(Some(RequestKind::Servo), false).reply.unwrap().result;
+                let servo = w.cycle(Some(RequestKind::Servo), false).reply.unwrap().result;
                 assert_eq!(servo, Err(Reject::WrongMode));
-                assert_eq!(w.beat(Some(RequestKind::Reset), false).reply.unwrap().result, Ok(()), "{code}");
+                assert_eq!(w.cycle(Some(RequestKind::Reset), false).reply.unwrap().result, Ok(()), "{code}");
                 w.run(300);
                 assert_eq!(w.cycle.mode().name(), ModeName::Tracking, "{code}");
             } else {
                 assert_eq!(w.cycle.mode().name(), ModeName::Armed, "{code}");
-                assert_eq!(w.beat(Some(RequestKind::Servo), false).reply.unwrap().result, Ok(()), "{code}");
+                assert_eq!(w.cycle(Some(RequestKind::Servo), false).reply.unwrap().result, Ok(()), "{code}");
             }
             w.judge_wire();
         }
@@ -189,18 +189,18 @@ fn any_fault_at_any_instant_ends_at_rest() {
 fn a_glitch_while_idle_is_outlived() {
     let mut w = World::new(9, |_| {});
     w.start();
-    w.beat(Some(RequestKind::Stop), false);
+    w.cycle(Some(RequestKind::Stop), false);
     w.run(800);
     assert_eq!(w.cycle.mode().name(), ModeName::Tracking);
     w.faults.jump_state = true;
     w.run(20);
     w.faults.jump_state = false;
     w.run(100);
-    let out = w.beat(Some(RequestKind::Arm), false);
+    let out = w.cycle(Some(RequestKind::Arm), false);
     assert_eq!(out.reply.unwrap().result, Err(Reject::RobotNotReady));
     assert_eq!(out.record.lasting.unwrap().code(), "F-ARM-16");
     w.run(1_200);
-    assert_eq!(w.beat(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()));
+    assert_eq!(w.cycle(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()));
 }
 
 /// The control script latches a fault of its own until it is told to idle: a reset must lead there, or nothing ever would.
@@ -212,18 +212,18 @@ fn a_reset_ends_the_scripts_own_fault() {
     w.faults.script_fault = true;
     w.run(400);
     assert_eq!(w.cycle.mode().fault().unwrap().cause.code(), "F-ARM-11");
-    let out = w.beat(Some(RequestKind::Reset), false);
+    let out = w.cycle(Some(RequestKind::Reset), false);
     assert_eq!((out.reply.unwrap().result, out.command.mode), (Ok(()), ArmMode::Idle));
     // Until the script has heard it, nothing can be armed.
-    assert_eq!(w.beat(Some(RequestKind::Arm), false).reply.unwrap().result, Err(Reject::RobotNotReady));
+    assert_eq!(w.cycle(Some(RequestKind::Arm), false).reply.unwrap().result, Err(Reject::RobotNotReady));
     w.faults.script_fault = false;
     w.run(300);
-    assert_eq!(w.beat(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()));
+    assert_eq!(w.cycle(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()));
 }
 
-/// A picture that stands still while the arm moves, an arm that stands still while it is told to move, one that creeps.
+/// An image that stands still while the arm moves, an arm that stands still while it is told to move, one that creeps.
 #[test]
-fn pictures_and_joints_that_disagree_are_noticed() {
+fn images_and_joints_that_disagree_are_noticed() {
     type Set = fn(&mut Faults);
     let table: [(Set, &[&str], u64); 2] =
         [(|f| f.frozen_vision = true, &["F-MRK-02", "F-MRK-01"], 260), (|f| f.stuck_arm = true, &["F-ARM-14"], 1500)];
@@ -232,14 +232,14 @@ fn pictures_and_joints_that_disagree_are_noticed() {
             let mut w = World::new(300 + trial, |_| {});
             w.start();
             // Into full speed: before that there is little to tell by.
-            while w.beat(None, false).record.screw.fixed_rows::<3>(0).norm() < 0.06 {
+            while w.cycle(None, false).record.screw.fixed_rows::<3>(0).norm() < 0.06 {
                 assert!(w.cycle.mode().drives(), "never came to speed");
             }
             w.run(60);
             let injected = w.now;
             set(&mut w.faults);
             while w.now < injected + bound_ms * MS && w.cycle.mode().fault().is_none() {
-                w.beat(None, false);
+                w.cycle(None, false);
             }
             let fault = w.cycle.mode().fault().unwrap_or_else(|| panic!("{codes:?} trial {trial}: not noticed"));
             assert!(codes.contains(&fault.cause.code()), "{:?}", fault.cause);
@@ -247,14 +247,14 @@ fn pictures_and_joints_that_disagree_are_noticed() {
     }
     let mut w = World::new(310, |_| {});
     w.run(500);
-    w.beat(None, true);
-    w.beat(Some(RequestKind::Arm), false);
+    w.cycle(None, true);
+    w.cycle(Some(RequestKind::Arm), false);
     w.faults.drift_arm = true;
     w.run(120);
     assert_eq!(w.cycle.mode().fault().map(|f| f.cause.code()), Some("F-ARM-15"));
 }
 
-/// A stop from any instant: the first slower set-point in the same beat, rest within the ramp, disarmed.
+/// A stop from any instant: the first slower set-point in the same cycle, rest within the ramp, disarmed.
 #[test]
 fn a_stop_request_is_a_bounded_ramp() {
     for seed in 0..20 {
@@ -263,7 +263,7 @@ fn a_stop_request_is_a_bounded_ramp() {
         let wait = 50 + w.rng.next() % 2500;
         w.run(wait);
         let before = w.sent.len();
-        let out = w.beat(Some(RequestKind::Stop), false);
+        let out = w.cycle(Some(RequestKind::Stop), false);
         assert_eq!(out.reply.unwrap().result, Ok(()));
         w.run(w.cycle.limits().ramp_ns() / MS + 4);
         let norm = |r: &[f64; 6]| r.iter().map(|v| v * v).sum::<f64>();
@@ -272,7 +272,7 @@ fn a_stop_request_is_a_bounded_ramp() {
         }
         assert_eq!(w.sent.last().unwrap().1, [0.0; 6]);
         assert_eq!(w.cycle.mode().name(), ModeName::Tracking);
-        assert_eq!(w.beat(Some(RequestKind::Servo), false).reply.unwrap().result, Err(Reject::WrongMode));
+        assert_eq!(w.cycle(Some(RequestKind::Servo), false).reply.unwrap().result, Err(Reject::WrongMode));
         w.judge_wire();
     }
 }
@@ -321,13 +321,13 @@ fn random_requests_and_faults_never_move_an_arm_that_is_not_servoing() {
                 _ => {}
             }
             let offer = w.rng.next().is_multiple_of(3);
-            let mut out = w.beat(Some(r), offer);
+            let mut out = w.cycle(Some(r), offer);
             for _ in 0..w.rng.next() % 200 {
                 let still =
                     matches!(out.record.mode, ModeName::Idle | ModeName::Tracking | ModeName::Armed | ModeName::Fault);
                 assert!(!still || out.command.rates == [0.0; 6], "seed {seed}: moves while {:?}", out.record.mode);
                 moved |= out.command.rates != [0.0; 6];
-                out = w.beat(None, false);
+                out = w.cycle(None, false);
             }
         }
         w.judge_wire();
@@ -348,7 +348,7 @@ fn closes_on_arrival_when_that_is_wanted() {
         converge(&mut w, 20).unwrap();
         w.run(5);
         assert_eq!(w.outputs, if wanted { 0x0201_0001 } else { 0 });
-        assert_eq!(w.beat(Some(RequestKind::Gripper { close: true }), false).reply.unwrap().result, Ok(()));
+        assert_eq!(w.cycle(Some(RequestKind::Gripper { close: true }), false).reply.unwrap().result, Ok(()));
         w.run(5);
         assert_eq!(w.outputs, 0x0201_0001);
         w.judge_wire();
@@ -367,10 +367,10 @@ fn turns_the_valve_about_its_axis_and_retreats() {
         let grasp = w.setpoint.grasp.left_from_gripper;
         let angle = 0.4;
         assert_eq!(
-            w.beat(Some(RequestKind::Turn { angle_rad: 9.0 }), false).reply.unwrap().result,
+            w.cycle(Some(RequestKind::Turn { angle_rad: 9.0 }), false).reply.unwrap().result,
             Err(Reject::BadValue)
         );
-        assert_eq!(w.beat(Some(RequestKind::Turn { angle_rad: angle }), false).reply.unwrap().result, Ok(()));
+        assert_eq!(w.cycle(Some(RequestKind::Turn { angle_rad: angle }), false).reply.unwrap().result, Ok(()));
         assert_eq!(w.outputs, 0x0001_0001, "closed before it turns");
         let before = w.error_to(&grasp);
         w.run(500);
@@ -383,7 +383,7 @@ fn turns_the_valve_about_its_axis_and_retreats() {
         let (mm, deg) = w.error_to(&goal);
         assert!(mm < 1.0 && deg < 0.5, "seed {seed}: {mm} mm {deg} degrees after the turn");
         assert_eq!(w.cycle.mode().name(), ModeName::Converged);
-        assert_eq!(w.beat(Some(RequestKind::Retreat), false).reply.unwrap().result, Ok(()));
+        assert_eq!(w.cycle(Some(RequestKind::Retreat), false).reply.unwrap().result, Ok(()));
         assert_eq!(w.outputs, 0x0001_0000, "opens before it leaves");
         let out = w.run(6_000);
         assert_eq!(out.record.stage, Stage::Retreat);
@@ -393,7 +393,7 @@ fn turns_the_valve_about_its_axis_and_retreats() {
     }
 }
 
-/// Reduced mode lowers the speed within a beat of the ramp; a slow slider slows the motion and winds nothing up.
+/// Reduced mode lowers the speed within a cycle of the ramp; a slow slider slows the motion and winds nothing up.
 #[test]
 fn reduced_mode_and_slider_only_slow_it_down() {
     let mut w = World::new(7, |_| {});
@@ -407,7 +407,7 @@ fn reduced_mode_and_slider_only_slow_it_down() {
     w.faults.safety_bits = Some(1 << 1);
     w.start();
     for _ in 0..1500 {
-        let out = w.beat(None, false);
+        let out = w.cycle(None, false);
         let top = out.command.rates.iter().fold(0.0_f64, |m, v| m.max(v.abs()));
         assert!(top <= 0.4 * 0.5 + 1e-9, "{top}");
     }
@@ -425,18 +425,18 @@ fn the_same_world_twice_is_the_same_to_the_bit() {
     assert_eq!(run(), run());
 }
 
-/// A goal that the arm cannot reach, a way that leaves the pictures and a plan without marks are refused before anything moves.
+/// A goal that the arm cannot reach, a way that leaves the images and a plan without marks are refused before anything moves.
 #[test]
 fn bad_goals_are_refused_with_the_reason() {
     let refused = |change: fn(&mut World)| {
         let mut w = World::new(3, |_| {});
         w.run(500);
         change(&mut w);
-        if let Some(Err(r)) = w.beat(None, true).setpoint_reply {
+        if let Some(Err(r)) = w.cycle(None, true).setpoint_reply {
             return r;
         }
-        w.beat(Some(RequestKind::Arm), false);
-        let r = w.beat(Some(RequestKind::Servo), false).reply.unwrap().result.unwrap_err();
+        w.cycle(Some(RequestKind::Arm), false);
+        let r = w.cycle(Some(RequestKind::Servo), false).reply.unwrap().result.unwrap_err();
         assert_eq!(w.cycle.mode().name(), ModeName::Armed);
         r
     };
@@ -447,7 +447,7 @@ fn bad_goals_are_refused_with_the_reason() {
     assert_eq!(refused(|w| w.setpoint.pregrasp.left_from_gripper.translation.vector.x += 2.0), Reject::PathLeavesView);
 }
 
-/// A rig that both stages believe wrongly: what closes in both pictures cancels it, one picture alone does not in depth.
+/// A rig that both stages believe wrongly: what closes in both images cancels it, one image alone does not in depth.
 #[test]
 fn calibration_error_cancels_in_stereo() {
     let run = |views: ViewMode| {
@@ -473,9 +473,9 @@ fn calibration_error_cancels_in_stereo() {
     run(ViewMode::Best);
 }
 
-/// Late and early beats: every change of rate stays within the acceleration limit over the time that really passed.
+/// Late and early cycles: every change of rate stays within the acceleration limit over the time that really passed.
 #[test]
-fn a_jittering_beat_breaks_no_limit() {
+fn a_jittering_cycle_breaks_no_limit() {
     for seed in 0..6 {
         let mut w = World::new(700 + seed, |_| {});
         w.faults.jitter = 0.6;
@@ -484,9 +484,9 @@ fn a_jittering_beat_breaks_no_limit() {
     }
 }
 
-/// Beats missed too often hold the arm; on a host that promises nothing they are only counted.
+/// Cycles missed too often hold the arm; on a host that promises nothing they are only counted.
 #[test]
-fn missed_beats_hold_or_are_counted() {
+fn missed_cycles_hold_or_are_counted() {
     let miss = |settings: fn(&mut CycleSettings)| {
         let mut w = World::new(9, settings);
         w.start();
@@ -494,7 +494,7 @@ fn missed_beats_hold_or_are_counted() {
             w.now += 5 * MS;
             w.run(20);
         }
-        (w.cycle.mode().name(), w.beat(None, false).record.counters.overruns)
+        (w.cycle.mode().name(), w.cycle(None, false).record.counters.overruns)
     };
     let (mode, _) = miss(|_| {});
     assert_eq!(mode, ModeName::Armed);

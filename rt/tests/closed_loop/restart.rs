@@ -13,7 +13,7 @@ fn restarted() -> World {
         s.task.open_outputs = 0x0201_0200;
     });
     converge(&mut w, 20).unwrap();
-    assert_eq!(w.beat(Some(RequestKind::Gripper { close: true }), false).reply.unwrap().result, Ok(()));
+    assert_eq!(w.cycle(Some(RequestKind::Gripper { close: true }), false).reply.unwrap().result, Ok(()));
     w.run(1_500);
     assert_eq!(w.cycle.mode().name(), ModeName::Converged);
     w.cycle = CommandCycle::new(w.config.clone()).unwrap();
@@ -22,20 +22,20 @@ fn restarted() -> World {
 }
 
 fn ask(w: &mut World, kind: RequestKind) -> Result<(), Reject> {
-    w.beat(Some(kind), false).reply.unwrap().result
+    w.cycle(Some(kind), false).reply.unwrap().result
 }
 
 #[test]
 fn a_restart_remembers_what_the_gripper_holds() {
     let mut w = restarted();
-    let out = w.beat(None, true);
+    let out = w.cycle(None, true);
     assert_eq!((out.record.grip, out.command.outputs), (Grip::Closed, 0), "it only looks");
     assert_eq!(ask(&mut w, RequestKind::Arm), Ok(()));
     w.run(300);
     assert_eq!(ask(&mut w, RequestKind::Servo), Err(Reject::GripperClosed));
     assert_eq!(ask(&mut w, RequestKind::Gripper { close: false }), Ok(()));
     w.run(300);
-    assert_eq!(w.beat(None, false).record.grip, Grip::Open);
+    assert_eq!(w.cycle(None, false).record.grip, Grip::Open);
     assert_eq!(ask(&mut w, RequestKind::Servo), Ok(()));
 }
 
@@ -43,7 +43,7 @@ fn a_restart_remembers_what_the_gripper_holds() {
 fn outputs_that_mean_neither_count_as_closed_and_the_pendant_may_open() {
     let mut w = restarted();
     w.levels = 0;
-    assert_eq!(w.beat(None, true).record.grip, Grip::Unknown);
+    assert_eq!(w.cycle(None, true).record.grip, Grip::Unknown);
     assert_eq!(ask(&mut w, RequestKind::Arm), Ok(()));
     w.run(300);
     assert_eq!(ask(&mut w, RequestKind::Servo), Err(Reject::GripperClosed));
@@ -113,7 +113,7 @@ fn thin_states_hold_the_arm() {
         w.one_of = one_of;
         let mut cause = None;
         while w.now < begun + 2_000 * MS && cause.is_none() && w.cycle.mode().drives() {
-            let out = w.beat(None, false);
+            let out = w.cycle(None, false);
             cause = out.event.and_then(|e| match e.why {
                 Why::Hold(c) => Some(c.code()),
                 _ => None,
@@ -140,7 +140,7 @@ fn few_marks_slow_the_arm_down() {
         w.start();
         let mut top = 0.0_f64;
         for _ in 0..1_000 {
-            top = top.max(w.beat(None, false).record.scale);
+            top = top.max(w.cycle(None, false).record.scale);
         }
         assert!(w.cycle.mode().drives());
         top

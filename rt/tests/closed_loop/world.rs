@@ -72,7 +72,7 @@ pub(crate) struct Faults {
     pub(crate) internal: bool,
     pub(crate) old_stamps: bool,
     pub(crate) skewed: bool,
-    /// Beats come up to this share of a period early or late.
+    /// Cycles come up to this share of a period early or late.
     pub(crate) jitter: f64,
     pub(crate) slider_zero: bool,
 }
@@ -311,7 +311,7 @@ impl World {
         (d, log_pose(&(p.inverse() * goal)).fixed_rows::<3>(3).norm().to_degrees())
     }
 
-    fn picture(&mut self) -> Vision {
+    fn image(&mut self) -> Vision {
         let pose = self.left_from_gripper();
         let mut marks = [[None; MAX_MARKS]; 2];
         let mut seen = [0; 2];
@@ -362,7 +362,7 @@ impl World {
         ToolPoint { offset: [0.0; 6], speed: [speed * scale, 0.0, 0.0, 0.0, 0.0, 0.0] }
     }
 
-    fn state(&mut self, beat: i32) -> RobotState {
+    fn state(&mut self, cycle: i32) -> RobotState {
         let f = self.faults;
         let mut s = RobotState {
             timestamp_s: self.now as f64 * 1e-9,
@@ -379,7 +379,7 @@ impl World {
             target_speed_fraction: if f.slider_zero { 0.0 } else { self.slider },
             digital_outputs: self.levels,
             tool: self.tool.map(|scale| self.tool_point(scale)),
-            echo: if f.echo_stuck { 12345 } else { beat },
+            echo: if f.echo_stuck { 12345 } else { cycle },
             script_state: 1,
             script_fault: i32::from(f.script_fault),
             script_token: if f.token { 99 } else { 42 },
@@ -396,12 +396,12 @@ impl World {
         s
     }
 
-    /// One beat with an optional request.
-    pub(crate) fn beat(&mut self, request: Option<RequestKind>, offer: bool) -> CommandOutput {
+    /// One cycle with an optional request.
+    pub(crate) fn cycle(&mut self, request: Option<RequestKind>, offer: bool) -> CommandOutput {
         let dt = self.period as f64 * 1e-9;
         let late = self.rng.even(self.faults.jitter) * self.period as f64;
         self.now += if self.faults.stall { 30 * MS } else { (self.period as f64 + late) as u64 };
-        // The arm: last beat's set-point, through a first-order lag.
+        // The arm: last cycle's set-point, through a first-order lag.
         let mut target = if self.pending.mode == ArmMode::Velocity { self.pending.rates } else { [0.0; 6] };
         let slider = if self.faults.slider_zero { 0.0 } else { self.slider };
         if self.faults.stuck_arm {
@@ -417,7 +417,7 @@ impl World {
         }
         while self.now >= self.next_capture {
             self.next_capture += self.frame_period;
-            let v = self.picture();
+            let v = self.image();
             if !self.faults.no_vision {
                 self.pipeline.push_back((self.now + 30 * MS, v));
             }
@@ -454,9 +454,9 @@ impl World {
             }
             self.last_vision = Some(*v);
         }
-        let beat = self.pending.beat;
-        let state = self.state(beat);
-        // One state a beat comes; what lies between two of them counts as left out.
+        let cycle = self.pending.heartbeat;
+        let state = self.state(cycle);
+        // One state a cycle comes; what lies between two of them counts as left out.
         self.states[0] += 1;
         self.states[1] += self.one_of - 1;
         let before = std::time::Instant::now();
@@ -476,7 +476,7 @@ impl World {
             setpoint: offer.then_some(&self.setpoint),
             internal_fault: self.faults.internal,
         });
-        assert_eq!(crate::heap::calls(), heap, "a beat used the heap");
+        assert_eq!(crate::heap::calls(), heap, "a cycle used the heap");
         self.step_ns.push(before.elapsed().as_nanos() as u64);
         self.pending = output.command;
         self.outputs = output.command.outputs;
@@ -488,9 +488,9 @@ impl World {
 
     pub(crate) fn run(&mut self, ms: u64) -> CommandOutput {
         let end = self.now + ms * MS;
-        let mut out = self.beat(None, false);
+        let mut out = self.cycle(None, false);
         while self.now < end {
-            out = self.beat(None, false);
+            out = self.cycle(None, false);
         }
         out
     }
@@ -498,9 +498,9 @@ impl World {
     /// Offers the set-point, arms and starts; panics with the reason if refused.
     pub(crate) fn start(&mut self) {
         self.run(500);
-        assert_eq!(self.beat(None, true).setpoint_reply, Some(Ok(())));
-        assert_eq!(self.beat(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()));
-        assert_eq!(self.beat(Some(RequestKind::Servo), false).reply.unwrap().result, Ok(()));
+        assert_eq!(self.cycle(None, true).setpoint_reply, Some(Ok(())));
+        assert_eq!(self.cycle(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()));
+        assert_eq!(self.cycle(Some(RequestKind::Servo), false).reply.unwrap().result, Ok(()));
     }
 
     /// The oracle: every set-point ever sent, finite, within speed, acceleration and position limits.

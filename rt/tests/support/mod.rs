@@ -1,7 +1,7 @@
 //! A small exact renderer for tests: discs and quads as a camera integrates them over its pixels, with blur, noise and lighting.
 //!
 //! Outlines are projected point by point through the lens model and filled with exact area coverage (signed areas, as font
-//! rasterisers do), so that the pictures have no sampling error that a tracker could be tuned to.
+//! rasterisers do), so that the images have no sampling error that a tracker could be tuned to.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used)]
 
 use graspd_rt::geom::{Camera, Distortion, Pose, Rig, Vec3, View, exp_twist};
@@ -88,7 +88,7 @@ impl Canvas {
         }
     }
 
-    /// Gain, offset and a ramp over the picture, then noise and rounding to bytes.
+    /// Gain, offset and a ramp over the image, then noise and rounding to bytes.
     pub fn expose(&self, camera: &Exposure, random: &mut Random) -> Vec<u8> {
         let table: Vec<f32> = (0..4096).map(|_| (random.normal() * camera.noise) as f32).collect();
         let across: Vec<f32> = (0..self.width)

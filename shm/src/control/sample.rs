@@ -34,7 +34,7 @@ pub struct TelemetrySample {
     pub layout_version: u32,
     /// Counts samples.
     pub sequence: u64,
-    /// CLOCK_MONOTONIC nanoseconds of the beat this sample describes.
+    /// CLOCK_MONOTONIC nanoseconds of the cycle this sample describes.
     pub stamp_ns: u64,
     /// 0 idle, 1 tracking, 2 armed, 3 servoing, 4 converged, 5 stopping, 6 fault.
     pub state: u32,
@@ -44,9 +44,9 @@ pub struct TelemetrySample {
     pub phase: u32,
     /// 0 stereo, 1 left, 2 right, 3 best.
     pub views: u32,
-    /// Beats of the command thread since start.
+    /// Cycles of the command thread since start.
     pub ticks: u64,
-    /// Beats that came a whole period late or later.
+    /// Cycles that came a whole period late or later.
     pub overruns: u64,
     /// Stereo pairs tracked.
     pub frames: u64,
@@ -62,7 +62,7 @@ pub struct TelemetrySample {
     pub robot_mode: i32,
     /// The controller's safety status bits.
     pub safety_bits: u32,
-    /// Bit set of the limits that shaped this beat's command.
+    /// Bit set of the limits that shaped this cycle's command.
     pub limits_active: u32,
     /// Measured joint positions, rad.
     pub q: [f64; 6],

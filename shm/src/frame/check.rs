@@ -21,11 +21,11 @@ pub enum Reject {
     Size,
     /// Rows overlap or the stride is absurd (C08).
     Stride,
-    /// A picture would reach beyond the payload that really arrived (H03).
+    /// An image would reach beyond the payload that really arrived (H03).
     Bounds,
     /// Left and right lie over each other (H03).
     Overlap,
-    /// Publisher says that the picture misses data (C09).
+    /// Publisher says that the image misses data (C09).
     Incomplete,
     /// A capture stamp lies in the future, or is zero (C10).
     Future,
@@ -112,10 +112,10 @@ impl std::fmt::Display for Reject {
             Reject::HeaderSize => "the header has another size: the publisher's struct differs from shm/LAYOUT.md",
             Reject::Torn => "the sample was torn (sequence and sequence_end differ)",
             Reject::Format => "unknown pixel format code",
-            Reject::Size => "picture size is not the calibration's",
+            Reject::Size => "image size is not the calibration's",
             Reject::Stride => "the stride is shorter than a row, or absurd",
-            Reject::Bounds => "a picture reaches beyond the payload",
-            Reject::Overlap => "left and right pictures overlap in the payload",
+            Reject::Bounds => "an image reaches beyond the payload",
+            Reject::Overlap => "left and right images overlap in the payload",
             Reject::Incomplete => "the publisher flagged the pair as incomplete",
             Reject::Future => "a capture stamp is zero or lies in the future: stamps are CLOCK_MONOTONIC nanoseconds",
             Reject::Stale => "the pair is too old",
@@ -223,7 +223,7 @@ pub fn check<'a>(
 /// Largest width or height that is believed.
 const MAX_SIDE: u32 = 16_384;
 
-/// Format and the two pictures, when the header's numbers fit each other and the payload.
+/// Format and the two images, when the header's numbers fit each other and the payload.
 pub(super) fn geometry<'a>(h: &StereoHeader, payload: &'a [u8]) -> Result<(PixelFormat, [&'a [u8]; 2]), Reject> {
     let format = PixelFormat::from_code(h.pixel_format).ok_or(Reject::Format)?;
     if h.width == 0 || h.height == 0 || h.width > MAX_SIDE || h.height > MAX_SIDE {
@@ -290,23 +290,23 @@ impl<'a> StereoFrame<'a> {
         self.format
     }
 
-    /// Raw bytes of a picture, rows of [`Self::stride`]; 0 is left, anything else right.
+    /// Raw bytes of an image, rows of [`Self::stride`]; 0 is left, anything else right.
     pub fn bytes(&self, eye: usize) -> &'a [u8] {
         self.eyes[usize::from(eye != 0)]
     }
 
-    /// A mono8 picture as it lies in shared memory (rows of [`Self::stride`]); `None` in any other format.
+    /// A mono8 image as it lies in shared memory (rows of [`Self::stride`]); `None` in any other format.
     pub fn mono8(&self, eye: usize) -> Option<&'a [u8]> {
         (self.format == PixelFormat::Mono8).then(|| self.bytes(eye))
     }
 
-    /// Writes a picture as 8-bit grey, `width * height` bytes without padding; `false` when `out` is too short.
+    /// Writes an image as 8-bit grey, `width * height` bytes without padding; `false` when `out` is too short.
     pub fn write_mono8(&self, eye: usize, out: &mut [u8]) -> bool {
         format::to_mono8(self.format, self.bytes(eye), self.width(), self.height(), self.stride(), out)
     }
 
-    /// A hash of a sparse sample of both pictures: equal for several pairs means that a camera is frozen (C03), since
-    /// noise changes every real picture. Reads one byte in about 61, i.e. some 43 000 of a 2 x 1280 x 1024 pair.
+    /// A hash of a sparse sample of both images: equal for several pairs means that a camera is frozen (C03), since
+    /// noise changes every real image. Reads one byte in about 61, i.e. some 43 000 of a 2 x 1280 x 1024 pair.
     pub fn fingerprint(&self) -> [u64; 2] {
         self.eyes.map(|e| {
             e.iter().step_by(61).fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(*b)).wrapping_mul(0x100_0000_01b3))

@@ -51,13 +51,13 @@ impl PixelFormat {
         }
     }
 
-    /// Whether the picture is a colour mosaic.
+    /// Whether the image is a colour mosaic.
     pub fn is_bayer(self) -> bool {
         matches!(self, Self::BayerRg8 | Self::BayerGr8 | Self::BayerGb8 | Self::BayerBg8)
     }
 }
 
-/// Converts one picture to 8-bit grey, `out` being `width * height` bytes, row by row. No allocation.
+/// Converts one image to 8-bit grey, `out` being `width * height` bytes, row by row. No allocation.
 ///
 /// Bayer mosaics are smoothed with the kernel 1-2-1 in both directions: at every pixel, whatever its colour, that weighs red 1/4,
 /// green 1/2 and blue 1/4, so that the four orders give the same grey and nothing shifts by half a pixel.
@@ -94,7 +94,7 @@ pub(crate) fn to_mono8(
                 }
             }
             _ => {
-                // The picture is continued by reflection, which keeps the mosaic's phase.
+                // The image is continued by reflection, which keeps the mosaic's phase.
                 let up = if y == 0 { 1.min(height - 1) } else { y - 1 };
                 let down = if y + 1 == height { y.saturating_sub(1) } else { y + 1 };
                 let (Some(a), Some(b)) = (row(up), row(down)) else { return false };

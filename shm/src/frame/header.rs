@@ -32,11 +32,11 @@ pub struct StereoHeader {
     pub exposure_ns: u64,
     /// Sensor gain, decibels.
     pub gain_db: f64,
-    /// Width of each picture, pixels.
+    /// Width of each image, pixels.
     pub width: u32,
-    /// Height of each picture, pixels.
+    /// Height of each image, pixels.
     pub height: u32,
-    /// Bytes from one row to the next, the same in both pictures.
+    /// Bytes from one row to the next, the same in both images.
     pub stride: u32,
     /// A [`crate::frame::PixelFormat`] code.
     pub pixel_format: u32,
@@ -64,9 +64,9 @@ const _: () = assert!(size_of::<StereoHeader>() == 192 && align_of::<StereoHeade
 
 /// Meaning of [`StereoHeader::flags`].
 pub mod flags {
-    /// The left picture misses data (lost packets).
+    /// The left image misses data (lost packets).
     pub const INCOMPLETE_LEFT: u32 = 1;
-    /// The right picture misses data (lost packets).
+    /// The right image misses data (lost packets).
     pub const INCOMPLETE_RIGHT: u32 = 2;
     /// The publisher could not keep its rate and dropped pairs just before this one.
     pub const OVERRUN: u32 = 4;
@@ -78,7 +78,7 @@ pub mod flags {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum ClockSource {
-    /// The host's clock when the picture arrived, corrected by a known latency.
+    /// The host's clock when the image arrived, corrected by a known latency.
     Host = 1,
     /// The cameras' clocks, mapped to CLOCK_MONOTONIC by the driver.
     Device = 2,

@@ -1,4 +1,4 @@
-//! The stereo frame topic: one sample is one pair of pictures with a fixed-layout header.
+//! The stereo frame topic: one sample is one pair of images with a fixed-layout header.
 
 mod check;
 mod format;

@@ -7,12 +7,12 @@ use crate::{Ipc, ShmError, ShmNode};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::prelude::AllocationStrategy;
 
-/// Size and format of the pictures a publisher sends.
+/// Size and format of the images a publisher sends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FrameGeometry {
-    /// Width of each picture, pixels.
+    /// Width of each image, pixels.
     pub width: u32,
-    /// Height of each picture, pixels.
+    /// Height of each image, pixels.
     pub height: u32,
     /// Bytes from one row to the next.
     pub stride: u32,
@@ -27,13 +27,13 @@ impl FrameGeometry {
         Self { width, height, stride, format }
     }
 
-    /// Bytes of one picture.
-    pub fn picture_bytes(&self) -> usize {
+    /// Bytes of one image.
+    pub fn image_bytes(&self) -> usize {
         self.stride as usize * self.height as usize
     }
 
     fn header(&self) -> StereoHeader {
-        let n = self.picture_bytes() as u64;
+        let n = self.image_bytes() as u64;
         StereoHeader {
             width: self.width,
             height: self.height,
@@ -76,7 +76,7 @@ impl FramePublisher {
     /// Joins the cell's frame topic with one size and format for the publisher's life.
     pub fn new(node: &ShmNode, geometry: FrameGeometry) -> Result<Self, ShmError> {
         let template = geometry.header();
-        let bytes = 2 * geometry.picture_bytes();
+        let bytes = 2 * geometry.image_bytes();
         // The header's own numbers must pass the reader's checks; an empty payload of the right length stands in.
         if let Err(r) = check::geometry(&template, &vec![0; bytes]) {
             return Err(ShmError::Geometry(r));
@@ -104,7 +104,7 @@ impl FramePublisher {
         self.template.clock_source = clock as u32;
     }
 
-    /// Size and format of the pictures.
+    /// Size and format of the images.
     pub fn geometry(&self) -> FrameGeometry {
         self.geometry
     }
@@ -122,7 +122,7 @@ impl FramePublisher {
 
     /// Loans the memory of one pair. Its bytes are those of some earlier pair: write all of them.
     pub fn loan(&mut self) -> Result<FrameLoan<'_>, ShmError> {
-        let bytes = 2 * self.geometry.picture_bytes();
+        let bytes = 2 * self.geometry.image_bytes();
         let loan =
             self.publisher.loan_slice_uninit(bytes).map_err(|e| ShmError::Loan { bytes, reason: format!("{e:?}") })?;
         Ok(FrameLoan { sample: sys::assume_bytes(loan), publisher: self })
@@ -137,9 +137,9 @@ pub struct FrameLoan<'p> {
 }
 
 impl FrameLoan<'_> {
-    /// Left and right picture, rows of the geometry's stride.
-    pub fn pictures(&mut self) -> (&mut [u8], &mut [u8]) {
-        let n = self.publisher.geometry.picture_bytes();
+    /// Left and right image, rows of the geometry's stride.
+    pub fn images(&mut self) -> (&mut [u8], &mut [u8]) {
+        let n = self.publisher.geometry.image_bytes();
         let payload = self.sample.payload_mut();
         let n = n.min(payload.len());
         payload.split_at_mut(n)

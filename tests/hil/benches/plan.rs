@@ -1,4 +1,4 @@
-//! Time of the off-line stage from two clicks to a plan on rendered pictures of 1280x1024, stage by stage, on one thread:
+//! Time of the off-line stage from two clicks to a plan on rendered images of 1280x1024, stage by stage, on one thread:
 //! `cargo bench -p graspd-hil --bench plan`. Processor time of this thread, so that a busy host does not count. Prints; never judges.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
@@ -7,8 +7,8 @@ use graspd_calib::offline::contour::select::Selection;
 use graspd_calib::offline::drawing::overlay;
 use graspd_calib::offline::edges::EdgeMap;
 use graspd_calib::offline::edges::arcs::Arcs;
+use graspd_calib::offline::edges::grey_image::GreyImage;
 use graspd_calib::offline::edges::lens::Lens;
-use graspd_calib::offline::edges::picture::Picture;
 use graspd_calib::offline::plan::{PlanOptions, Prepared, plan};
 use graspd_hil::scenario::{Options, Scenario};
 use graspd_hil::scene::Snapshot;
@@ -49,11 +49,11 @@ fn main() {
             false => Snapshot { object_from_gripper: [None; 2], opening: 0.1, frame: 0, hidden_marks: 0 },
         };
         let mut renderer = s.renderer();
-        let pictures = View::BOTH.map(|v| {
-            let p = renderer.picture(v, &shot);
-            Picture::new(p.width() as usize, p.height() as usize, p.into_raw()).unwrap()
+        let images = View::BOTH.map(|v| {
+            let p = renderer.image(v, &shot);
+            GreyImage::new(p.width() as usize, p.height() as usize, p.into_raw()).unwrap()
         });
-        let pair = [&pictures[0], &pictures[1]];
+        let pair = [&images[0], &images[1]];
         let truth = s.left_from_object();
         let clicks = if options.with_arm {
             s.clicks
@@ -71,7 +71,7 @@ fn main() {
         gripper.opening[1] = 1.0;
         let o = PlanOptions::default();
         println!("{name}:");
-        time("  edges of both pictures", || {
+        time("  edges of both images", || {
             black_box(pair.map(EdgeMap::detect));
         });
         let maps = pair.map(EdgeMap::detect);
@@ -82,13 +82,13 @@ fn main() {
         time("  contours, rim model, grasp, plan (edges known)", || {
             black_box(prepared.plan(selected, &gripper, &o).ok());
         });
-        time("  all: from two pictures and two clicks to a plan", || {
+        time("  all: from two images and two clicks to a plan", || {
             black_box(plan(pair, selected, &rig, &gripper, &o).ok());
         });
         match plan(pair, selected, &rig, &gripper, &o) {
             Ok(p) => {
-                println!("  ({}, {:?} spots for the order of the pictures)", p.file.object.model, prepared.order());
-                time("  picture of the plan (not part of it)", || {
+                println!("  ({}, {:?} spots for the order of the images)", p.file.object.model, prepared.order());
+                time("  image of the plan (not part of it)", || {
                     black_box(overlay::draw(&p, pair, &rig, &gripper));
                 });
             }

@@ -1,9 +1,9 @@
-//! Plans on the first pictures of many random cells and compares with the truth: `plan_seeds FIRST COUNT [occlusion]`.
+//! Plans on the first images of many random cells and compares with the truth: `plan_seeds FIRST COUNT [occlusion]`.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::RigFile;
 use graspd_calib::offline::contour::select::Selection;
-use graspd_calib::offline::edges::picture::Picture;
+use graspd_calib::offline::edges::grey_image::GreyImage;
 use graspd_calib::offline::plan::{PlanOptions, plan};
 use graspd_hil::scenario::{Options, Scenario};
 use graspd_rt::geom::View;
@@ -23,8 +23,8 @@ fn main() {
         let mut renderer = scenario.renderer();
         let (w, h) = (scenario.true_rig.left.width as usize, scenario.true_rig.left.height as usize);
         let shot = scenario.snapshot(&scenario.start, 1);
-        let [l, r] = View::BOTH.map(|v| renderer.picture(v, &shot).into_raw());
-        let (Some(l), Some(r)) = (Picture::new(w, h, l), Picture::new(w, h, r)) else { continue };
+        let [l, r] = View::BOTH.map(|v| renderer.image(v, &shot).into_raw());
+        let (Some(l), Some(r)) = (GreyImage::new(w, h, l), GreyImage::new(w, h, r)) else { continue };
         let clicks = scenario.clicks.map(Selection::Click);
         let rig = RigFile::new(scenario.given_rig);
         match plan([&l, &r], [&clicks[0], &clicks[1]], &rig, &scenario.gripper, &PlanOptions::default()) {

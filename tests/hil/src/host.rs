@@ -7,7 +7,7 @@ use thread_priority::{RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriori
 
 /// SCHED_FIFO priority of the mock controller's servo: above the daemon's threads, as a controller is no part of the daemon's machine.
 pub(crate) const CONTROLLER: u8 = 92;
-/// Of the camera's look at the arm, which gives every picture its joints.
+/// Of the camera's look at the arm, which gives every image its joints.
 pub(crate) const EXPOSURE: u8 = 90;
 
 /// Niceness of rendering. It takes a third of a processor, and the kernel stops *all* real-time threads of a processor for 50 ms when

@@ -1,4 +1,4 @@
-//! The daemon's own control script under the interpreter: handshake, rates, refusals, a beat that stands still.
+//! The daemon's own control script under the interpreter: handshake, rates, refusals, a heartbeat that stops.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod desk;
@@ -33,8 +33,8 @@ fn script() -> String {
     text
 }
 
-/// One step with a fresh beat.
-fn beat(m: &mut Machine, desk: &mut Desk) {
+/// One step with a fresh cycle.
+fn cycle(m: &mut Machine, desk: &mut Desk) {
     desk.ints[25] += 1;
     assert_eq!(m.step(desk), StepOutcome::Running);
 }
@@ -44,7 +44,7 @@ fn ready() -> (Machine, Desk) {
     let mut desk = Desk::default();
     desk.ints[26] = TOKEN;
     for _ in 0..6 {
-        beat(&mut m, &mut desk);
+        cycle(&mut m, &mut desk);
     }
     assert_eq!(desk.out_ints[25], 2, "idle after the handshake");
     (m, desk)
@@ -72,14 +72,14 @@ fn nothing_moves_without_our_token() {
 }
 
 #[test]
-fn rates_reach_the_arm_and_the_beat_comes_back() {
+fn rates_reach_the_arm_and_the_heartbeat_comes_back() {
     let (mut m, mut desk) = ready();
     assert_eq!(desk.watchdog, Some(("input_int_register_25".into(), 20.0, WatchdogAction::Stop)));
     desk.ints[24] = 1;
     desk.floats[30] = 3.0;
     desk.floats[26] = -0.5;
-    beat(&mut m, &mut desk);
-    beat(&mut m, &mut desk);
+    cycle(&mut m, &mut desk);
+    cycle(&mut m, &mut desk);
     assert_eq!(last_rates(&desk), [0.0, 0.0, -0.5, 0.0, 0.0, 0.0]);
     assert_eq!((desk.out_ints[24], desk.out_ints[25]), (desk.ints[25], 3));
 }
@@ -91,27 +91,27 @@ fn a_rate_over_the_limit_or_nan_is_refused_and_the_arm_told_to_rest() {
         desk.ints[24] = 1;
         desk.floats[30] = 3.0;
         desk.floats[24] = bad;
-        beat(&mut m, &mut desk);
-        beat(&mut m, &mut desk);
+        cycle(&mut m, &mut desk);
+        cycle(&mut m, &mut desk);
         assert_eq!((desk.out_ints[25], desk.out_ints[26]), (7, 1), "{bad}");
         assert_eq!(last_rates(&desk), [0.0; 6], "{bad}");
     }
 }
 
 #[test]
-fn a_beat_that_stands_still_stops_the_arm_in_bound() {
+fn a_heartbeat_that_stops_stops_the_arm_in_bound() {
     let (mut m, mut desk) = ready();
     desk.ints[24] = 1;
     desk.floats[30] = 3.0;
     desk.floats[24] = 0.5;
-    beat(&mut m, &mut desk);
-    beat(&mut m, &mut desk);
+    cycle(&mut m, &mut desk);
+    cycle(&mut m, &mut desk);
     assert_eq!(last_rates(&desk)[0], 0.5);
     let mut steps = 0;
     while last_rates(&desk) != [0.0; 6] {
         assert_eq!(m.step(&mut desk), StepOutcome::Running);
         steps += 1;
-        assert!(steps <= PATIENCE + 1, "still moving {steps} steps after the last beat");
+        assert!(steps <= PATIENCE + 1, "still moving {steps} steps after the last cycle");
     }
     assert_eq!((desk.out_ints[25], desk.out_ints[26]), (7, 4));
 }
@@ -120,8 +120,8 @@ fn a_beat_that_stands_still_stops_the_arm_in_bound() {
 fn outputs_follow_the_word() {
     let (mut m, mut desk) = ready();
     desk.ints[27] = (0b10_0000_0101 << 16) | 0b10_0000_0001;
-    beat(&mut m, &mut desk);
-    beat(&mut m, &mut desk);
+    cycle(&mut m, &mut desk);
+    cycle(&mut m, &mut desk);
     let mut set = desk.out_bits.clone();
     set.sort_unstable();
     assert_eq!(set, [(1000, true), (1001, true), (1002, false)]);

@@ -38,14 +38,14 @@ fn arm() -> MockArm {
 
 struct Client {
     arm: MockArm,
-    beat: i32,
+    cycle: i32,
     rate: f64,
 }
 
 impl Client {
     /// The script runs and has shaken hands.
     fn ready() -> Client {
-        let mut c = Client { arm: arm(), beat: 0, rate: 0.0 };
+        let mut c = Client { arm: arm(), cycle: 0, rate: 0.0 };
         assert_eq!(c.arm.upload(&script()), Upload::Main);
         for _ in 0..20 {
             c.command(0, 0.0);
@@ -56,11 +56,11 @@ impl Client {
 
     /// One set-point and one step.
     fn command(&mut self, mode: i32, rate: f64) {
-        self.beat += 1;
+        self.cycle += 1;
         self.rate = rate;
         let mut values = vec![
             (input("input_int_register_24"), Value::Int32(mode)),
-            (input("input_int_register_25"), Value::Int32(self.beat)),
+            (input("input_int_register_25"), Value::Int32(self.cycle)),
             (input("input_int_register_26"), Value::Int32(TOKEN)),
             (input("input_int_register_27"), Value::Int32(0)),
             (input("input_double_register_30"), Value::Double(4.0)),
@@ -92,7 +92,7 @@ fn the_daemons_script_moves_the_arm_within_its_promise() {
     c.run_up(0.4);
     assert!((c.arm.robot().truth.actual_qd[0] - 0.4).abs() < 1e-3);
     assert!(c.arm.robot().truth.actual_q[0] > start + 0.04);
-    assert_eq!(c.arm.robot().outputs.ints[24], c.beat, "the beat is echoed");
+    assert_eq!(c.arm.robot().outputs.ints[24], c.cycle, "the heartbeat is echoed");
     assert_eq!(c.arm.summary().limit_violations, 0, "{:?}", c.arm.summary().violations);
 }
 

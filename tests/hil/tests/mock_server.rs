@@ -299,10 +299,10 @@ fn a_client_killed_in_motion_leaves_the_arm_at_rest_by_the_wire_record() {
         let (_, recipe) = ask(&mut s, 73, b"input_int_register_24,input_int_register_25,input_double_register_24");
         assert_eq!(recipe[0], 1, "{}", String::from_utf8_lossy(&recipe));
         let mut rate = 0.0f64;
-        for beat in 0..(60 + 13 * kill as i32) {
+        for cycle in 0..(60 + 13 * kill as i32) {
             let mut body = vec![1];
             body.extend_from_slice(&1i32.to_be_bytes());
-            body.extend_from_slice(&(1000 * kill as i32 + beat + 1).to_be_bytes());
+            body.extend_from_slice(&(1000 * kill as i32 + cycle + 1).to_be_bytes());
             body.extend_from_slice(&rate.to_be_bytes());
             s.write_all(&package(85, &body)).unwrap();
             rate = (rate + 0.008).min(0.4);

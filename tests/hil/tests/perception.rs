@@ -1,4 +1,4 @@
-//! The tracker against the simulated cell's own pictures, whose truth it is not told: acquisition at the start and before the
+//! The tracker against the simulated cell's own images, whose truth it is not told: acquisition at the start and before the
 //! valve, then tracking along the way.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
@@ -20,7 +20,7 @@ fn off(truth: &Pose, found: &Pose) -> (f64, f64) {
 }
 
 #[test]
-fn the_gripper_is_found_and_followed_in_the_cells_pictures() {
+fn the_gripper_is_found_and_followed_in_the_cells_images() {
     let mut scratch = Box::new(AcquireScratch::new());
     for seed in 0..SEEDS {
         let cell = Scenario::from_seed(seed, &Options::default()).expect("a cell for this seed");
@@ -41,12 +41,12 @@ fn the_gripper_is_found_and_followed_in_the_cells_pictures() {
                 frame: k,
                 hidden_marks: 0,
             };
-            let pictures = View::BOTH.map(|v| {
+            let images = View::BOTH.map(|v| {
                 let mut data = vec![0; w * h];
                 renderer.draw(v, &shot, &mut data, w);
                 data
             });
-            let [left, right] = [0, 1].map(|i| ImageView::new(&pictures[i], w, h, w).expect("a picture"));
+            let [left, right] = [0, 1].map(|i| ImageView::new(&images[i], w, h, w).expect("an image"));
             let settings = AcquireSettings::default();
             if k == 0 || k == STEPS {
                 let a = acquire(&cell.given_rig, &cell.gripper.gripper, &left, &right, &settings, &mut scratch);

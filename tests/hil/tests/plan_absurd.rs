@@ -1,4 +1,4 @@
-//! Wrong and absurd selections on pictures: none may give a wrong answer that passes more often than 1 in 1,000, none may panic.
+//! Wrong and absurd selections on images: none may give a wrong answer that passes more often than 1 in 1,000, none may panic.
 //!
 //! A few hundred here; all of it: `GRASPD_SELECTIONS=10000 cargo test --release -p graspd-hil --test plan_absurd -- --nocapture`, and on other cells with
 //! `GRASPD_FIRST_SEED=1001` before it. `GRASPD_RIG_ERROR=0.5,0.1` gives a rig that is wrong by half a percent of focal length and 0.1 degrees: an
@@ -15,7 +15,7 @@ use reference::{POINTS, Shape, around, best_fit};
 
 use graspd_calib::files::{GripperFile, RigFile};
 use graspd_calib::offline::contour::select::Selection;
-use graspd_calib::offline::edges::picture::Picture;
+use graspd_calib::offline::edges::grey_image::GreyImage;
 use graspd_calib::offline::plan::{Plan, PlanError, PlanOptions, Prepared};
 use graspd_hil::scenario::{Circle, Options, Scenario};
 use graspd_hil::scene::Snapshot;
@@ -31,13 +31,13 @@ const KINDS: [&str; 8] = [
     "both near the rim, not on it",
     "rim against another object",
     "boxes and points anywhere",
-    "pictures exchanged with their clicks",
-    "pictures exchanged, clicks not",
+    "images exchanged with their clicks",
+    "images exchanged, clicks not",
 ];
 
 struct Cell {
     scenario: Scenario,
-    pictures: [Picture; 2],
+    images: [GreyImage; 2],
     circles: Vec<Circle>,
     /// Centre and normal of every circle as it is, and as the given rig has it.
     places: Vec<[Vec3; 2]>,
@@ -50,13 +50,13 @@ fn cell_of(seed: u64, options: &Options) -> Cell {
         false => Snapshot { object_from_gripper: [None; 2], opening: 0.1, frame: 0, hidden_marks: 0 },
     };
     let mut renderer = scenario.renderer();
-    let pictures = View::BOTH.map(|v| {
-        let p = renderer.picture(v, &shot);
-        Picture::new(p.width() as usize, p.height() as usize, p.into_raw()).unwrap()
+    let images = View::BOTH.map(|v| {
+        let p = renderer.image(v, &shot);
+        GreyImage::new(p.width() as usize, p.height() as usize, p.into_raw()).unwrap()
     });
     let circles = scenario.circles(&shot);
     let places = circles.iter().flat_map(|c| places(&scenario, c)).collect();
-    Cell { scenario, pictures, circles, places }
+    Cell { scenario, images, circles, places }
 }
 
 /// Where a circle is, and where the best fit to its exact edges is when the given rig is believed. A bar's core has the bar's outlines for edges.
@@ -84,7 +84,7 @@ fn is_there(p: &Plan, places: &[[Vec3; 2]]) -> bool {
     })
 }
 
-/// One selection of a kind in a cell, as given to the pictures in that order.
+/// One selection of a kind in a cell, as given to the images in that order.
 fn selections(kind: usize, c: &Cell, r: &mut ChaCha8Rng) -> [Selection; 2] {
     let (w, h) = (f64::from(c.scenario.true_rig.left.width), f64::from(c.scenario.true_rig.left.height));
     let anywhere = |r: &mut ChaCha8Rng| Pixel::new(r.random_range(0.0..w - 1.0), r.random_range(0.0..h - 1.0));
@@ -141,8 +141,8 @@ fn absurd_selections_give_no_wrong_answer() {
         let rig = RigFile::new(c.scenario.given_rig);
         let mut gripper: GripperFile = c.scenario.gripper.clone();
         gripper.opening[1] = 1.0;
-        let straight = Prepared::new([&c.pictures[0], &c.pictures[1]], &rig).unwrap();
-        let exchanged = Prepared::new([&c.pictures[1], &c.pictures[0]], &rig).unwrap();
+        let straight = Prepared::new([&c.images[0], &c.images[1]], &rig).unwrap();
+        let exchanged = Prepared::new([&c.images[1], &c.images[0]], &rig).unwrap();
         for k in 0..each {
             // An exchange is the same question however often it is asked: two of a kind in each cell.
             let kind = if k < 4 { 6 + k % 2 } else { k % 6 };
@@ -173,7 +173,7 @@ fn absurd_selections_give_no_wrong_answer() {
             }
         }
         let v = exchanged.order();
-        eprintln!("seed {seed}: exchanged pictures: {v:?}, as they are: {:?}", straight.order());
+        eprintln!("seed {seed}: exchanged images: {v:?}, as they are: {:?}", straight.order());
     }
     for (k, name) in KINDS.iter().enumerate() {
         eprintln!("{name:<40} {:>6} asked, {:>5} a rim that is there, {:>4} wrong", asked[k], found[k], wrong[k]);

@@ -1,4 +1,4 @@
-//! The scene's pictures against its truth: drawn cells are usable, discs and circles lie where projection says, depth decides.
+//! The scene's images against its truth: drawn cells are usable, discs and circles lie where projection says, depth decides.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::scenario::{Options, STANDOFF_M, Scenario, seen_marks};
@@ -115,7 +115,7 @@ fn centroid(p: &[u8], width: usize, at: Pixel, reach: f64) -> Pixel {
     Pixel::new(u / m, v / m)
 }
 
-/// Centroid of a disc's picture, by projecting many pieces of it, each weighed with the area it takes in the picture.
+/// Centroid of a disc's image, by projecting many pieces of it, each weighed with the area it takes in the image.
 fn exact_centroid(camera: &Camera, centre: &Vec3, normal: &Vec3, radius: f64) -> Pixel {
     let u = normal.cross(&Vec3::new(0.3, 0.5, 0.8)).normalize();
     let v = normal.cross(&u);
@@ -243,7 +243,7 @@ fn the_valve_hides_what_is_behind_it_and_is_hidden_by_what_is_in_front() {
 }
 
 #[test]
-fn pictures_repeat_with_their_number_and_noise_does_not() {
+fn images_repeat_with_their_number_and_noise_does_not() {
     let o = Options { size: [320, 256], focal_px: 300.0, with_arm: false, ..Default::default() };
     let s = Scenario::from_seed(6, &o).unwrap();
     let mut v = ViewRenderer::new(&s.stage, s.true_rig.left, s.left_from_object(), s.sensor);

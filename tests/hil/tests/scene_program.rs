@@ -195,13 +195,13 @@ fn rows_of_numbers_are_taken_in_the_form_of_the_help() {
         assert_eq!(out.status.code(), Some(2), "{option} {bad}");
         assert!(String::from_utf8_lossy(&out.stderr).contains("2 numbers"), "{option} {bad}");
     }
-    let pictures = |joints: &str| {
+    let images = |joints: &str| {
         let mut c = Command::new(env!("CARGO_BIN_EXE_graspd-scene"));
-        c.arg("--world").arg(dir.join("plain")).args(["--joints", joints, "--pictures"]).arg(dir.join("pictures"));
+        c.arg("--world").arg(dir.join("plain")).args(["--joints", joints, "--images"]).arg(dir.join("images"));
         c.output().unwrap()
     };
-    assert!(pictures("-0.1,-1.6,1.9,-1.87,-1.57,0").status.success());
-    assert_eq!(pictures("1,2,3").status.code(), Some(2));
+    assert!(images("-0.1,-1.6,1.9,-1.87,-1.57,0").status.success());
+    assert_eq!(images("1,2,3").status.code(), Some(2));
     std::fs::remove_dir_all(&dir).unwrap();
 }
 

@@ -8,7 +8,7 @@
 //! the limb's place as the only unknown that does not enter linearly.
 
 use crate::offline::edges::Refined;
-use crate::offline::edges::picture::Picture;
+use crate::offline::edges::grey_image::GreyImage;
 use crate::offline::edges::sharpen::{CORRELATED, REACH, SCALE, SLOPE_NOISE, SLOPES, slopes, tangential_width};
 use nalgebra::{SMatrix, SVector};
 
@@ -119,13 +119,13 @@ impl Limb {
     /// `None` where nothing is to be seen of it.
     pub(in crate::offline) fn place(
         &self,
-        picture: &Picture,
+        image: &GreyImage,
         start: &Refined,
         outward: graspd_rt::geom::Pixel,
         noise: f64,
         blur: f64,
     ) -> Option<Refined> {
-        let slope = slopes(picture, start.at, outward)?;
+        let slope = slopes(image, start.at, outward)?;
         let cost = |t0: f64| self.fit(&slope, t0).map(|f| f.0);
         let steps = (FARTHEST / STEP) as i32;
         let mut best = (f64::INFINITY, 0.0);
@@ -186,7 +186,7 @@ mod tests {
     use rand::SeedableRng;
     use rand_distr::{Distribution, Normal};
 
-    /// A straight bar's limb through the middle of a picture: grey of the background, and of the bar as `a + b (1 - d/r) + c sqrt(..)`.
+    /// A straight bar's limb through the middle of an image: grey of the background, and of the bar as `a + b (1 - d/r) + c sqrt(..)`.
     struct Scene {
         background: f64,
         bar: [f64; 3],
@@ -201,7 +201,7 @@ mod tests {
         }
 
         /// Seen through a Gaussian lens of 0.6 px and integrated over square pixels, by a table of the blurred profile.
-        fn picture(&self, noise: f64, seed: u64) -> Picture {
+        fn image(&self, noise: f64, seed: u64) -> GreyImage {
             const FINE: f64 = 0.01;
             let sharp = |t: f64| {
                 let d = (self.shift - t) / self.radius;
@@ -238,7 +238,7 @@ mod tests {
                     (v + normal.sample(&mut rng)).round().clamp(0.0, 255.0) as u8
                 })
                 .collect();
-            Picture::new(48, 48, data).unwrap()
+            GreyImage::new(48, 48, data).unwrap()
         }
 
         /// Error outward, pixels, and the stated sigma.
@@ -247,7 +247,7 @@ mod tests {
             let n = self.outward();
             let start = Refined { at: Pixel::new(24.0, 24.0), towards_bright: n, sigma: 0.1, width: 1.2 };
             let limb = Limb::new(blur, self.radius)?;
-            let r = limb.place(&self.picture(noise, seed), &start, n, noise.max(0.3), blur)?;
+            let r = limb.place(&self.image(noise, seed), &start, n, noise.max(0.3), blur)?;
             Some(((r.at - Pixel::new(24.0, 24.0)).dot(&n) - self.shift, r.sigma))
         }
     }
@@ -275,7 +275,7 @@ mod tests {
                 let blur = 0.6f64.hypot((1.0f64 / 12.0).sqrt());
                 let bright = if background > 100.0 { scene.outward() } else { -scene.outward() };
                 let edge = Refined { towards_bright: bright, ..start };
-                let step = crate::offline::edges::sharpen::sharpen(&scene.picture(0.0, 0), &edge, 0.3, blur);
+                let step = crate::offline::edges::sharpen::sharpen(&scene.image(0.0, 0), &edge, 0.3, blur);
                 let at = step.map_or(1.0, |s| (s.at - Pixel::new(24.0, 24.0)).dot(&scene.outward()) - scene.shift);
                 worst_step = worst_step.max(at.abs());
             }

@@ -1,4 +1,4 @@
-//! Where a bar's outlines are in a picture, and which edges there are likely to be theirs.
+//! Where a bar's outlines are in an image, and which edges there are likely to be theirs.
 
 use crate::offline::bar::torus::{Torus, outline};
 use crate::offline::conic::robust::median;
@@ -48,7 +48,7 @@ impl<'a, 'b> View<'a, 'b> {
         step / px
     }
 
-    /// The likeliest edge of an outline at each place in the picture, and how likely the whole is, from 0 to 1.
+    /// The likeliest edge of an outline at each place in the image, and how likely the whole is, from 0 to 1.
     ///
     /// An outline is the sharpest step there is; a bar's shading makes softer ones of its own beside it, all the way round. So the strong edge wins, not the
     /// nearest.
@@ -56,7 +56,7 @@ impl<'a, 'b> View<'a, 'b> {
         let (mut sum, mut seen, mut hits) = (0.0, 0usize, Vec::with_capacity(places.len()));
         for p in places {
             let raw = self.edges.lens.raw(p.at);
-            if !self.edges.picture.contains(raw, 6.0) {
+            if !self.edges.image.contains(raw, 6.0) {
                 continue;
             }
             seen += 1;

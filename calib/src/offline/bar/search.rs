@@ -1,7 +1,7 @@
 //! A round bar looked for from one clicked outline a view: its other outline is where a bar of some thickness would show it in *both* views.
 //!
 //! One outline of a bar leaves its thickness open, but nothing else: for every thickness there is one bar that has the clicked outlines, and it says
-//! where the other outline has to be in both pictures. So thickness is tried from thin to thick, and each is judged by the edges there. Around the best ones
+//! where the other outline has to be in both images. So thickness is tried from thin to thick, and each is judged by the edges there. Around the best ones
 //! all four outlines are followed along the curves that the bar predicts (an outline is no ellipse) and the bar is fitted to them, until it stands still.
 
 use crate::offline::bar::found::BarFound;
@@ -31,9 +31,9 @@ pub(in crate::offline) struct Search {
 /// Support of an outline that is seen whole in both views.
 const WHOLE: f64 = 1.5;
 
-/// Thinnest and thickest picture of a bar, in parts of the outline's semi-major axis.
+/// Thinnest and thickest image of a bar, in parts of the outline's semi-major axis.
 const WIDTH: [f64; 2] = [0.05, 0.65];
-/// Thinnest picture of a bar, pixels: what is thinner is a line.
+/// Thinnest image of a bar, pixels: what is thinner is a line.
 const THIN_PX: f64 = 4.0;
 /// Step of the search, pixels.
 const STEP: f64 = 2.0;
@@ -63,7 +63,7 @@ struct Guess {
 /// its outline.
 const AS_LIKELY: f64 = 0.85;
 
-/// Looks for the bar whose outline was clicked. `plane` is what the contours are a picture of if they are a plane rim; with the bar's diameter known only that is tried.
+/// Looks for the bar whose outline was clicked. `plane` is what the contours are an image of if they are a plane rim; with the bar's diameter known only that is tried.
 pub(in crate::offline) fn find(
     views: [&ViewEdges<'_>; 2],
     clicked: [&Contour; 2],

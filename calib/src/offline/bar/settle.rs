@@ -162,9 +162,9 @@ fn followed(
         let limb = Limb::new(blur, torus.bar / v.pixel_at(&torus.centre));
         // Away from the bar is out of the outer outline, and into the inner one.
         let finish = |r: &Refined, out: Pixel| {
-            let plain = || sharpen(v.edges.picture, r, noise, blur);
+            let plain = || sharpen(v.edges.image, r, noise, blur);
             match &limb {
-                Some(l) => l.place(v.edges.picture, r, out, noise, blur).or_else(|| {
+                Some(l) => l.place(v.edges.image, r, out, noise, blur).or_else(|| {
                     let r = if sharp == Sharp::Spoilt { plain()? } else { return None };
                     Some(Refined { sigma: r.sigma.hypot(SPOILT_PX), ..r })
                 }),

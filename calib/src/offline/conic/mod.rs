@@ -1,4 +1,4 @@
-//! Conics in one picture: ellipse and matrix forms, the direct fit, and the geometric fit with its covariance.
+//! Conics in one image: ellipse and matrix forms, the direct fit, and the geometric fit with its covariance.
 //!
 //! A conic is a symmetric 3x3 `C` with `u^T C u = 0`, oriented so that the outside is positive (signature + + -), unit Frobenius norm.
 

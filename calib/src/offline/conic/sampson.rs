@@ -1,6 +1,6 @@
 //! First-order (Sampson) distances of edge points to a conic, gathered into normal equations in the conic's own six coefficients.
 //!
-//! Every model of this crate that predicts a conic in a picture is fitted through the same sums: with the derivative `D` (6 x p) of
+//! Every model of this crate that predicts a conic in an image is fitted through the same sums: with the derivative `D` (6 x p) of
 //! the coefficients by the model's parameters, the normal equations are `D^T A D` and `D^T g`. One pass over the points costs the
 //! same whatever the model, which is why a two-view fit with covariance takes a fraction of a millisecond.
 

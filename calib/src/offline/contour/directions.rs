@@ -2,7 +2,7 @@
 //!
 //! A trial ellipse is judged at up to 160 places, and a seed has a thousand trials. At most places of a wrong one there are edges, but of other
 //! directions. So each pixel remembers which sectors of normals an edge in reach could answer. A normal in any other sector has no edge for certain; for
-//! the rest the edges themselves are looked at. Pixels are made ready by the tile, when the first of it is asked for: most of a picture never is.
+//! the rest the edges themselves are looked at. Pixels are made ready by the tile, when the first of it is asked for: most of an image never is.
 
 use super::ViewEdges;
 use graspd_rt::geom::Pixel;
@@ -21,7 +21,7 @@ const QUARTER: u32 = 8;
 
 type Tile = [[u32; TILE]; TILE];
 
-/// The tiles of a picture.
+/// The tiles of an image.
 #[derive(Clone, Debug)]
 pub(super) struct Directions {
     columns: usize,
@@ -57,7 +57,7 @@ fn sectors_round(d: Pixel) -> u32 {
 }
 
 impl ViewEdges<'_> {
-    /// Whether an edge in reach of a raw pixel inside the picture could have the direction `towards_bright`, ideal pixels, to within [`ALONG`].
+    /// Whether an edge in reach of a raw pixel inside the image could have the direction `towards_bright`, ideal pixels, to within [`ALONG`].
     pub(super) fn may_have_edge(&self, raw: Pixel, towards_bright: Pixel) -> bool {
         let d = &self.directions;
         let (x, y) = (raw.x.round() as usize, raw.y.round() as usize);
@@ -88,7 +88,7 @@ impl ViewEdges<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::offline::edges::picture::Picture;
+    use crate::offline::edges::grey_image::GreyImage;
     use graspd_rt::geom::{Camera, Distortion};
 
     #[test]
@@ -100,8 +100,8 @@ mod tests {
             128.0 + 60.0 * (0.31 * x + 0.12 * y).sin() + 55.0 * (0.4 * (x - 90.0).hypot(y - 60.0)).cos()
         };
         let data = (0..200 * 170).map(|i| grey(f64::from(i % 200), f64::from(i / 200)) as u8).collect();
-        let picture = Picture::new(200, 170, data).unwrap();
-        let view = ViewEdges::new(&picture, &camera);
+        let image = GreyImage::new(200, 170, data).unwrap();
+        let view = ViewEdges::new(&image, &camera);
         let (mut answered, mut passed, mut asked) = (0, 0, 0);
         for i in 0..4000 {
             let at =

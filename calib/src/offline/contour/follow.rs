@@ -1,4 +1,4 @@
-//! Edge points along a curve that is known beforehand: the outline that a model predicts, followed in the picture.
+//! Edge points along a curve that is known beforehand: the outline that a model predicts, followed in the image.
 //!
 //! Growing a contour asks which edges lie on one ellipse. Here the curve is given (the outline of a bar is no ellipse), and only the edges next to
 //! it are wanted, one for each stretch that is independent of its neighbours, told apart from nearby ones and brought to their place.
@@ -25,7 +25,7 @@ pub(in crate::offline) type Finish<'f> = dyn Fn(&Refined, Pixel) -> Option<Refin
 /// Where a curve carries edges.
 #[derive(Clone, Debug, Default)]
 pub(in crate::offline) struct Support {
-    /// Places that lie in the picture.
+    /// Places that lie in the image.
     pub(in crate::offline) seen: usize,
     /// Edge found at each place, if any.
     pub(in crate::offline) hits: Vec<Option<u32>>,
@@ -70,7 +70,7 @@ impl ViewEdges<'_> {
         let mut out = Support::default();
         for p in places {
             let raw = self.lens.raw(p.at);
-            if !self.picture.contains(raw, 6.0) {
+            if !self.image.contains(raw, 6.0) {
                 continue;
             }
             out.seen += 1;
@@ -100,7 +100,7 @@ impl ViewEdges<'_> {
         let any = self.support(places, tolerance, None);
         let bright =
             |k: u32, p: &Place| self.arcs.ideal.get(k as usize).is_some_and(|i| i.towards_bright.dot(&p.normal) < 0.0);
-        let seen: Vec<&Place> = places.iter().filter(|p| self.picture.contains(self.lens.raw(p.at), 6.0)).collect();
+        let seen: Vec<&Place> = places.iter().filter(|p| self.image.contains(self.lens.raw(p.at), 6.0)).collect();
         let (mut inside, mut outside) = (0usize, 0usize);
         for (h, p) in any.hits.iter().zip(&seen) {
             if let Some(k) = h {

@@ -1,4 +1,4 @@
-//! Trial ellipses through a seed edge, and how well the edges of the picture support them.
+//! Trial ellipses through a seed edge, and how well the edges of the image support them.
 
 use crate::offline::contour::directions::{ALONG, REACH};
 use crate::offline::contour::quick_fit::{Sums, Walk};
@@ -188,7 +188,7 @@ impl ViewEdges<'_> {
         let (mut seen, mut likely) = (0usize, 0usize);
         self.turns.round(Walk::new(e), GLANCES, |p, n| {
             let raw = self.lens.raw(p);
-            if self.picture.contains(raw, 6.0) {
+            if self.image.contains(raw, 6.0) {
                 seen += 1;
                 likely += usize::from(self.may_have_edge(raw, n * sign));
             }
@@ -218,11 +218,11 @@ impl ViewEdges<'_> {
             coverage * coverage * root
         };
         let places = w.places(3.0, &self.turns);
-        // Places in the picture that may have an edge: most of a wrong trial's have none, and tell so at a glance.
+        // Places in the image that may have an edge: most of a wrong trial's have none, and tell so at a glance.
         let (mut seen, mut likely) = (0usize, Vec::with_capacity(places.len()));
         for (i, (p, n)) in places.iter().enumerate() {
             let raw = self.lens.raw(*p);
-            if !self.picture.contains(raw, 6.0) {
+            if !self.image.contains(raw, 6.0) {
                 continue;
             }
             seen += 1;

@@ -1,6 +1,6 @@
 //! A contour: the edge points of one ellipse, gathered through gaps, spokes and occlusions.
 //!
-//! A seed edge and its arc are tried alone and with every other arc of the picture that could lie on the same convex curve with the same brighter side;
+//! A seed edge and its arc are tried alone and with every other arc of the image that could lie on the same convex curve with the same brighter side;
 //! each trial ellipse is judged by how much of it carries edges of the right direction. The best few are fitted again to the edges they gathered until
 //! they stop changing, then the edges in a narrow band are taken by consensus, thinned to independent ones and refined.
 
@@ -16,8 +16,8 @@ use crate::offline::contour::directions::Directions;
 use crate::offline::contour::grow::Trial;
 use crate::offline::contour::quick_fit::{Sums, Turns, Walk};
 use crate::offline::edges::arcs::Arcs;
+use crate::offline::edges::grey_image::GreyImage;
 use crate::offline::edges::lens::Lens;
-use crate::offline::edges::picture::Picture;
 use crate::offline::edges::sharpen::{lens_blur, sharpen};
 use crate::offline::edges::{self, EdgeMap, Refined};
 use crate::offline::rim::model::{EdgePoint, Ellipse2, Outline};
@@ -40,11 +40,11 @@ const BEYOND: f64 = 2.0;
 /// Smallest part of an ellipse that has to carry edges.
 pub(in crate::offline) const LEAST_COVERAGE: f64 = 0.25;
 
-/// A picture with everything that contours are grown from.
+/// An image with everything that contours are grown from.
 #[derive(Clone, Debug)]
 pub struct ViewEdges<'a> {
-    /// The picture.
-    pub picture: &'a Picture,
+    /// The image.
+    pub image: &'a GreyImage,
     /// Its edge points.
     pub map: EdgeMap,
     /// Their arcs.
@@ -80,7 +80,7 @@ enum Sharpened {
 /// An edge point of a contour.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ContourPoint {
-    /// Where it is in the picture.
+    /// Where it is in the image.
     pub raw: Pixel,
     /// The same without lens distortion, with its standard deviation.
     pub edge: EdgePoint,
@@ -126,9 +126,9 @@ impl Contour {
 }
 
 impl<'a> ViewEdges<'a> {
-    /// Detects and links the edges of a picture taken by this camera.
-    pub fn new(picture: &'a Picture, camera: &Camera) -> Self {
-        let map = EdgeMap::detect(picture);
+    /// Detects and links the edges of an image taken by this camera.
+    pub fn new(image: &'a GreyImage, camera: &Camera) -> Self {
+        let map = EdgeMap::detect(image);
         let lens = Lens::new(camera);
         let arcs = Arcs::link(&map, &lens);
         let samples = arcs
@@ -145,7 +145,7 @@ impl<'a> ViewEdges<'a> {
         let turns = Turns::new(grow::MOST_PLACES);
         let directions = Directions::new(map.width(), map.height());
         let (refined, sharp) = (RefCell::default(), RefCell::default());
-        Self { picture, map, arcs, lens, samples, longest, blur: OnceCell::new(), turns, directions, refined, sharp }
+        Self { image, map, arcs, lens, samples, longest, blur: OnceCell::new(), turns, directions, refined, sharp }
     }
 
     /// The contour of a trial: edges by consensus, thinned, refined, with their ellipse. `None` when too little is left.
@@ -246,14 +246,14 @@ impl<'a> ViewEdges<'a> {
         if let Some(known) = self.refined.borrow().get(&k) {
             return *known;
         }
-        let r = self.map.edges().get(k as usize).and_then(|e| edges::refine(self.picture, e, self.map.noise()));
+        let r = self.map.edges().get(k as usize).and_then(|e| edges::refine(self.image, e, self.map.noise()));
         self.refined.borrow_mut().insert(k, r);
         r
     }
 
-    /// Standard deviation of a sharp edge's picture, pixels; measured once.
+    /// Standard deviation of a sharp edge's image, pixels; measured once.
     pub(in crate::offline) fn blur(&self) -> f64 {
-        *self.blur.get_or_init(|| lens_blur(self.picture, &self.map))
+        *self.blur.get_or_init(|| lens_blur(self.image, &self.map))
     }
 
     /// What becomes of a contour when every edge is told apart from its neighbours (see [`crate::offline::edges::sharpen`]).
@@ -282,7 +282,7 @@ impl<'a> ViewEdges<'a> {
             let ahead = self.lens.raw(p.edge.uv + n * 0.5) - self.lens.raw(p.edge.uv - n * 0.5);
             let Some(towards_bright) = (ahead * sign).try_normalize(1e-9) else { continue };
             let start = Refined { at: p.raw, towards_bright, sigma: p.edge.sigma, width: 1.0 };
-            match sharpen(self.picture, &start, self.map.noise(), blur) {
+            match sharpen(self.image, &start, self.map.noise(), blur) {
                 Some(r) => {
                     let r = r.straightened(n, w.radius(t));
                     let Some(ideal) = self.lens.ideal(r.at) else { continue };
@@ -299,7 +299,7 @@ impl<'a> ViewEdges<'a> {
         let Some(sharp) = points_on_one_ellipse(points, c.ellipse, c.bright_inside, bins, rejected) else {
             return Sharpened::TooFew;
         };
-        // Where edges are no blurred steps (a real lens, texture beside the rim, a picture that was sharpened or compressed) taking them apart scatters them, by
+        // Where edges are no blurred steps (a real lens, texture beside the rim, an image that was sharpened or compressed) taking them apart scatters them, by
         // more than it says. What it moves them by is then doubt, and no correction.
         let says = median(sharp.points.iter().map(|p| p.edge.sigma).collect());
         if sharp.rms_px > SCATTERED_BY * c.rms_px && sharp.rms_px > BEYOND * says {
@@ -309,7 +309,7 @@ impl<'a> ViewEdges<'a> {
     }
 }
 
-/// Two views' pictures of one contour with every edge told apart from its neighbours, where that can be done.
+/// Two views' images of one contour with every edge told apart from its neighbours, where that can be done.
 ///
 /// What scatters the edges of one view would do so in the other, only less visibly, and what neighbours move edges by is much the same in both: it leaves the depth
 /// alone as long as both views keep it. So both are told apart, or neither.

@@ -1,7 +1,7 @@
 //! From what the operator selected to the contours that may be meant.
 //!
 //! A click near a painted line means one of its two edges, and nobody knows which; the other view decides. So a selection gives a few contours, the
-//! likeliest first, each through edges next to the click, and the pair that is the picture of one rim is taken (see [`crate::offline::decide::pairing`]).
+//! likeliest first, each through edges next to the click, and the pair that is the image of one rim is taken (see [`crate::offline::decide::pairing`]).
 
 use crate::offline::contour::quick_fit::Walk;
 use crate::offline::contour::{Contour, LEAST_COVERAGE, Trial, ViewEdges, alike};
@@ -41,16 +41,16 @@ impl Selection {
 /// Why a selection leads to no contour.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SelectError {
-    /// A pixel outside the picture.
-    #[error("the {} selection ({:.1}, {:.1}) lies outside the {width}x{height} picture: click inside it", name(.view), at.x, at.y)]
+    /// A pixel outside the image.
+    #[error("the {} selection ({:.1}, {:.1}) lies outside the {width}x{height} image: click inside it", name(.view), at.x, at.y)]
     Outside {
         /// The view.
         view: View,
         /// The pixel.
         at: Pixel,
-        /// Width of the picture.
+        /// Width of the image.
         width: usize,
-        /// Height of the picture.
+        /// Height of the image.
         height: usize,
     },
     /// No edge near the click.
@@ -107,7 +107,7 @@ pub struct Candidate {
     pub cost: f64,
 }
 
-/// How far from an edge a click may be: an operator's hand on a large picture.
+/// How far from an edge a click may be: an operator's hand on a large image.
 pub fn snap_radius(width: usize) -> f64 {
     (0.01 * width as f64).clamp(8.0, 20.0)
 }
@@ -127,8 +127,8 @@ pub fn contours(
     keep: usize,
 ) -> Result<Vec<Candidate>, SelectError> {
     for p in selection.pixels() {
-        if !edges.picture.contains(p, 0.0) {
-            let (width, height) = (edges.picture.width(), edges.picture.height());
+        if !edges.image.contains(p, 0.0) {
+            let (width, height) = (edges.image.width(), edges.image.height());
             return Err(SelectError::Outside { view, at: p, width, height });
         }
     }
@@ -162,7 +162,7 @@ fn seeds(edges: &ViewEdges<'_>, at: Pixel, radius: f64) -> Vec<(f64, usize)> {
 }
 
 fn click(view: View, edges: &ViewEdges<'_>, at: Pixel, keep: usize) -> Result<Vec<Candidate>, SelectError> {
-    let radius = snap_radius(edges.picture.width());
+    let radius = snap_radius(edges.image.width());
     let seeds = seeds(edges, at, radius);
     if seeds.is_empty() {
         let nearest = edges
@@ -220,7 +220,7 @@ fn points(view: View, edges: &ViewEdges<'_>, at: &[Pixel], keep: usize) -> Resul
     let Some(first) = at.first() else {
         return Err(SelectError::Empty { view, fix: "give at least one point on the contour" });
     };
-    let radius = snap_radius(edges.picture.width());
+    let radius = snap_radius(edges.image.width());
     let mut out: Vec<Candidate> = Vec::new();
     let (mut best, mut any) = (0.0f64, false);
     for p in at.iter().take(32) {

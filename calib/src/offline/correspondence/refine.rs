@@ -1,7 +1,7 @@
 //! A match to a fraction of a pixel: the patch of one image is shifted over the other until their grey values agree
 //! best.
 
-use crate::offline::edges::picture::Picture;
+use crate::offline::edges::grey_image::GreyImage;
 use graspd_rt::geom::Pixel;
 use nalgebra::{Matrix4, Vector4};
 
@@ -37,7 +37,7 @@ impl Found {
 /// brightness.
 ///
 /// `None` where the patches do not agree or do not determine the shift.
-pub(super) fn refine(images: [&Picture; 2], from: Pixel, start: Pixel, noise: f64) -> Option<Found> {
+pub(super) fn refine(images: [&GreyImage; 2], from: Pixel, start: Pixel, noise: f64) -> Option<Found> {
     let [a, b] = images;
     let margin = f64::from(HALF) + 2.0;
     let mut at = start;
@@ -88,7 +88,7 @@ pub(super) fn refine(images: [&Picture; 2], from: Pixel, start: Pixel, noise: f6
     (found.cov.trace().sqrt() < MOST_SIGMA_PX && (at - start).norm() <= FARTHEST_PX).then_some(found)
 }
 
-fn patch(image: &Picture, at: Pixel) -> Option<Vec<f64>> {
+fn patch(image: &GreyImage, at: Pixel) -> Option<Vec<f64>> {
     if !image.contains(at, f64::from(HALF) + 2.0) {
         return None;
     }
@@ -102,7 +102,7 @@ fn patch(image: &Picture, at: Pixel) -> Option<Vec<f64>> {
 }
 
 /// Bilinear grey value and its derivatives.
-fn sample(image: &Picture, x: f64, y: f64) -> Option<(f64, f64, f64)> {
+fn sample(image: &GreyImage, x: f64, y: f64) -> Option<(f64, f64, f64)> {
     let (x0, y0) = (x.floor(), y.floor());
     let (fx, fy) = (x - x0, y - y0);
     let k = x0 as usize;

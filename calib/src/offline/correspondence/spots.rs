@@ -1,22 +1,22 @@
-//! Whether two pictures were given in the wrong order, from everything that is in them.
+//! Whether two images were given in the wrong order, from everything that is in them.
 //!
 //! A rim near the middle of a symmetrical rig can be reconstructed from its two contours either way round: the
-//! contours alone cannot tell. The rest of the pictures can. Distinct spots of one picture are looked for in the
+//! contours alone cannot tell. The rest of the images can. Distinct spots of one image are looked for in the
 //! other along the lines, and in front of both cameras, where the rig says that they have to be; in the right order
 //! they are found, in the wrong one their lines run elsewhere, or their places lie behind the cameras.
 
 use crate::offline::correspondence::refine;
 use crate::offline::correspondence::rig_error::Match;
+use crate::offline::edges::grey_image::GreyImage;
 use crate::offline::edges::lens::Lens;
-use crate::offline::edges::picture::Picture;
 use crate::offline::rim::cone::camera_centre;
 use crate::offline::rim::model::Projection;
 use graspd_rt::geom::Pixel;
 use nalgebra::Vector3;
 
-/// Cells of the left picture that give one spot each, across and down.
+/// Cells of the left image that give one spot each, across and down.
 const CELLS: [usize; 2] = [20, 16];
-/// Half the side of a patch, pixels of the halved picture.
+/// Half the side of a patch, pixels of the halved image.
 const HALF: i32 = 6;
 /// A spot is found where the correlation is at least this.
 const FOUND: f64 = 0.75;
@@ -34,12 +34,12 @@ const MOST_PLACES: usize = 420;
 pub struct Votes {
     /// For the order as given.
     pub as_given: usize,
-    /// For the pictures exchanged.
+    /// For the images exchanged.
     pub exchanged: usize,
 }
 
 impl Votes {
-    /// Whether the pictures were given in the wrong order, beyond chance.
+    /// Whether the images were given in the wrong order, beyond chance.
     pub fn are_exchanged(&self) -> bool {
         self.exchanged >= LEAST && self.exchanged > 3 * self.as_given
     }
@@ -56,7 +56,7 @@ const SIDE: usize = 2 * HALF as usize + 1;
 /// other one does not count.
 const LANES: usize = 16;
 
-/// A picture at half its size: quick to search, and blind to the noise. Its values are sums of four grey values, so
+/// An image at half its size: quick to search, and blind to the noise. Its values are sums of four grey values, so
 /// that all sums are exact.
 struct Small {
     w: usize,
@@ -67,7 +67,7 @@ struct Small {
 }
 
 impl Small {
-    fn of(p: &Picture) -> Self {
+    fn of(p: &GreyImage) -> Self {
         let (w, h) = (p.width() / 2, p.height() / 2);
         let stride = w + LANES - SIDE;
         let mut sums = Vec::with_capacity(stride * h);
@@ -194,7 +194,7 @@ fn size(sum: i32, square: i32, least: f32) -> Option<f64> {
     (size > 0.0 && size >= 4.0 * f64::from(least) * COUNT.sqrt()).then_some(size)
 }
 
-/// Sums and sums of squares over every patch of a picture.
+/// Sums and sums of squares over every patch of an image.
 ///
 /// The squares' running sums overflow; what wraps round drops out of the differences, and those of a patch fit.
 struct Totals {
@@ -203,7 +203,7 @@ struct Totals {
 }
 
 impl Totals {
-    fn of_picture(p: &Small) -> Self {
+    fn of_image(p: &Small) -> Self {
         let stride = p.stride + 1;
         let mut running = vec![[0u32; 2]; stride];
         running.reserve(stride * p.h);
@@ -220,9 +220,9 @@ impl Totals {
         Self { stride, running }
     }
 
-    /// Sum and sum of squares of the patch that begins at a place of the picture.
+    /// Sum and sum of squares of the patch that begins at a place of the image.
     fn of(&self, first: usize) -> Option<(i32, i32)> {
-        // The running sums have one column more than the picture.
+        // The running sums have one column more than the image.
         let at = first + first / (self.stride - 1);
         let corner = |k: usize| self.running.get(at + k);
         let below = SIDE * self.stride;
@@ -243,12 +243,12 @@ pub struct Spots {
 }
 
 /// Looks for the spots of the first image in the second, in both orders. `noise` is the images' noise in grey levels.
-pub fn spots(images: [&Picture; 2], lenses: [&Lens; 2], p: [&Projection; 2], noise: f64) -> Spots {
+pub fn spots(images: [&GreyImage; 2], lenses: [&Lens; 2], p: [&Projection; 2], noise: f64) -> Spots {
     let mut out = Spots::default();
     let small = images.map(Small::of);
     let (Some(a), Some(b)) = (Ray::new(lenses, p, 0), Ray::new(lenses, p, 1)) else { return out };
     let least = (1.5 * noise).max(1.0) as f32;
-    let totals = Totals::of_picture(&small[1]);
+    let totals = Totals::of_image(&small[1]);
     for (x, y) in small[0].spots() {
         let Some(wanted) = small[0].patch(x as i32, y as i32, least) else { continue };
         let at = Pixel::new(2.0 * x as f64 + 0.5, 2.0 * y as f64 + 0.5);
@@ -311,7 +311,7 @@ fn search(places: &[(i32, i32)], correlation: impl Fn(i32, i32) -> Option<f32>) 
     best
 }
 
-/// From a pixel of one camera's picture to its line in the other's.
+/// From a pixel of one camera's image to its line in the other's.
 struct Ray<'a> {
     lenses: [&'a Lens; 2],
     to: &'a Projection,
@@ -341,7 +341,7 @@ impl<'a> Ray<'a> {
         Pixel::new(l.x, l.y).try_normalize(1e-12)
     }
 
-    /// Half-size pixels of the other picture, one after the other, from near to infinitely far.
+    /// Half-size pixels of the other image, one after the other, from near to infinitely far.
     fn places(&self, raw: Pixel) -> Vec<(i32, i32)> {
         let Some(i) = self.lenses[0].ideal(raw) else { return Vec::new() };
         let d = self.back * Vector3::new(i.x, i.y, 1.0);

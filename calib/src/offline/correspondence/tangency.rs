@@ -1,14 +1,14 @@
-//! Whether two contours are pictures of one rim (section 4.2, errata B3).
+//! Whether two contours are images of one rim (section 4.2, errata B3).
 //!
 //! Two image ellipses have 10 parameters and a conic in space 8, so a match obeys two conditions; the paper's
-//! polynomial is one of them. Both are seen in the picture: each epipolar line tangent to the left ellipse must be
+//! polynomial is one of them. Both are seen in the image: each epipolar line tangent to the left ellipse must be
 //! tangent to the right one.
 
 use crate::offline::conic::{EllipseFit, ellipse_of};
 use crate::offline::rim::model::Projection;
 use nalgebra::{Matrix3, Vector2, Vector3, Vector4};
 
-/// The two epipolar tangency gaps in the right picture, pixels, signed; NaN where the epipole lies inside the left
+/// The two epipolar tangency gaps in the right image, pixels, signed; NaN where the epipole lies inside the left
 /// ellipse.
 ///
 /// `o_left` is the left projection centre (last coordinate 1), in the frame of both matrices.

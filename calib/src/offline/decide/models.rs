@@ -38,7 +38,7 @@ pub(in crate::offline) struct Weighed {
     pub(in crate::offline) log: f64,
 }
 
-/// Prior probabilities. They matter little: a model that is right beats the others by tens of units of the logarithm,
+/// Prior probabilities. They matter little: a model that is right cycles the others by tens of units of the logarithm,
 /// and what does not is asked about.
 ///
 /// A hand chooses the same contour in both images, and the contours offered to it include its neighbours; rims are

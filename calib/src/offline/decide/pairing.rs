@@ -1,4 +1,4 @@
-//! Which contours of the two views are pictures of one rim, and of what kind of rim.
+//! Which contours of the two views are images of one rim, and of what kind of rim.
 //!
 //! Each view's selection gives a few contours, likeliest first. Every pair is weighed by the likelihood: circle,
 //! ellipse, two contours that have nothing to do with each other. For the likeliest pair a round bar with the clicked
@@ -28,7 +28,7 @@ pub struct Pair {
     pub contours: [Contour; 2],
     /// The inner outlines, where the rim turned out to be a round bar.
     pub inner: [Option<Contour>; 2],
-    /// What they are a picture of.
+    /// What they are an image of.
     pub reconstruction: Reconstruction,
     /// The rig with its expected error put right: what predicts places in the images.
     pub rig: Rig,
@@ -155,7 +155,7 @@ fn judge(
     Ok(out)
 }
 
-/// Finds the likeliest pair that is the picture of one rim. `views` are where the candidates come from.
+/// Finds the likeliest pair that is the image of one rim. `views` are where the candidates come from.
 pub fn pair(
     views: [&ViewEdges<'_>; 2],
     candidates: [&[Candidate]; 2],

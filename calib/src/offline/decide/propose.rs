@@ -11,7 +11,7 @@ use crate::offline::rim::reconstruct::reconstruct;
 pub struct Proposal {
     /// Its contours, left and right.
     pub contours: [Contour; 2],
-    /// The plane rim that they are a picture of.
+    /// The plane rim that they are an image of.
     pub reconstruction: Reconstruction,
     /// By which proposals are ranked: complete, large and consistent first.
     pub score: f64,
@@ -100,7 +100,7 @@ pub fn propose(
             }
         }
     }
-    // The best pair first; each ellipse is the picture of one rim only.
+    // The best pair first; each ellipse is the image of one rim only.
     found.sort_by(|a, b| b.0.total_cmp(&a.0));
     let (mut used_left, mut used_right) = (vec![false; left.len()], vec![false; right.len()]);
     let mut out = Vec::new();

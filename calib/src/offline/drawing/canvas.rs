@@ -155,7 +155,7 @@ impl Canvas {
         let _ = Text::with_baseline(text, TextPoint::zero(), style, Baseline::Top).draw(&mut ink);
     }
 
-    /// A label with a dark rim, readable on any picture; centred at a place.
+    /// A label with a dark rim, readable on any image; centred at a place.
     pub fn label(&mut self, at: Pixel, text: &str, face: Face, scale: u32, colour: Rgba) {
         let size = face.font().character_size;
         let s = f64::from(scale.max(1));

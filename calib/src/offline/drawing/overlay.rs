@@ -1,12 +1,12 @@
-//! The picture of a plan, like the paper's figure 7: both views, the contour and its ellipse, the plane's normal, the predicted gripper and marks.
+//! The image of a plan, like the paper's figure 7: both views, the contour and its ellipse, the plane's normal, the predicted gripper and marks.
 
 use crate::files::{GripperFile, OrientedBox, RigFile};
 use crate::offline::contour::Contour;
 use crate::offline::contour::quick_fit::Walk;
 use crate::offline::decide::propose::Proposal;
 use crate::offline::drawing::canvas::{Canvas, Face, Rgba};
+use crate::offline::edges::grey_image::GreyImage;
 use crate::offline::edges::lens::Lens;
-use crate::offline::edges::picture::Picture;
 use crate::offline::handle::grasp::object_frame;
 use crate::offline::plan::{Plan, model_name};
 use graspd_rt::geom::{Pixel, Pose, Vec3, View};
@@ -36,13 +36,13 @@ pub(in crate::offline) struct Panel<'a> {
 }
 
 impl<'a> Panel<'a> {
-    pub(in crate::offline) fn new(picture: &Picture, view: View, rig: &'a RigFile, zoom: f64) -> Option<Self> {
-        let (w, h) = ((picture.width() as f64 * zoom).round() as u32, (picture.height() as f64 * zoom).round() as u32);
+    pub(in crate::offline) fn new(image: &GreyImage, view: View, rig: &'a RigFile, zoom: f64) -> Option<Self> {
+        let (w, h) = ((image.width() as f64 * zoom).round() as u32, (image.height() as f64 * zoom).round() as u32);
         let mut canvas = Canvas::new(w, h, BACK)?;
-        let across = steps(w, zoom, picture.width());
-        let down = steps(h, zoom, picture.height());
+        let across = steps(w, zoom, image.width());
+        let down = steps(h, zoom, image.height());
         for (line, y) in canvas.pixmap.pixels_mut().chunks_exact_mut(w.max(1) as usize).zip(&down) {
-            let rows = [picture.row(y.from), picture.row(y.to)];
+            let rows = [image.row(y.from), image.row(y.to)];
             for (q, x) in line.iter_mut().zip(&across) {
                 let at = |row: &[u8], i: usize| row.get(i).map_or(0.0, |v| f64::from(*v));
                 let mix = |row: &[u8]| at(row, x.from) * (1.0 - x.part) + at(row, x.to) * x.part;
@@ -172,14 +172,14 @@ impl<'a> Panel<'a> {
     }
 }
 
-/// Where a drawn row or column lies between two of the picture's.
+/// Where a drawn row or column lies between two of the image's.
 struct Step {
     from: usize,
     to: usize,
     part: f64,
 }
 
-/// The steps of `count` drawn rows or columns over `size` of the picture, the border repeated.
+/// The steps of `count` drawn rows or columns over `size` of the image, the border repeated.
 fn steps(count: u32, zoom: f64, size: usize) -> Vec<Step> {
     let last = size.saturating_sub(1);
     (0..count)
@@ -210,12 +210,12 @@ fn heading(canvas: &mut Canvas, x: f64, y: f64, s: u32, parts: &[(&str, Rgba)]) 
     }
 }
 
-/// Draws a plan; the bytes of a PNG file. `None` only when the pictures are too large to be drawn.
-pub fn draw(plan: &Plan, pictures: [&Picture; 2], rig: &RigFile, gripper: &GripperFile) -> Option<Vec<u8>> {
-    let (zoom, unit) = scales(pictures);
+/// Draws a plan; the bytes of a PNG file. `None` only when the images are too large to be drawn.
+pub fn draw(plan: &Plan, images: [&GreyImage; 2], rig: &RigFile, gripper: &GripperFile) -> Option<Vec<u8>> {
+    let (zoom, unit) = scales(images);
     let mut panels = Vec::new();
     for (k, view) in View::BOTH.iter().enumerate() {
-        panels.push(draw_view(plan, k, *view, pictures[k], rig, gripper, zoom, unit)?);
+        panels.push(draw_view(plan, k, *view, images[k], rig, gripper, zoom, unit)?);
     }
     sheet(
         &panels,
@@ -235,9 +235,9 @@ pub fn draw(plan: &Plan, pictures: [&Picture; 2], rig: &RigFile, gripper: &Gripp
     )
 }
 
-/// Zoom of the pictures and the unit of strokes and letters: each view about a thousand pixels wide, in half steps so that pixels stay alike.
-pub(in crate::offline) fn scales(pictures: [&Picture; 2]) -> (f64, f64) {
-    let widest = pictures[0].width().max(pictures[1].width()) as f64;
+/// Zoom of the images and the unit of strokes and letters: each view about a thousand pixels wide, in half steps so that pixels stay alike.
+pub(in crate::offline) fn scales(images: [&GreyImage; 2]) -> (f64, f64) {
+    let widest = images[0].width().max(images[1].width()) as f64;
     let zoom = ((2.0 * 1100.0 / widest).round() / 2.0).clamp(0.5, 4.0);
     (zoom, (widest * zoom / 1100.0).max(0.6))
 }
@@ -290,13 +290,13 @@ pub(in crate::offline) fn sheet(
 }
 
 /// Draws proposals, numbered, in both views.
-pub fn draw_proposals(found: &[Proposal], pictures: [&Picture; 2], rig: &RigFile) -> Option<Vec<u8>> {
+pub fn draw_proposals(found: &[Proposal], images: [&GreyImage; 2], rig: &RigFile) -> Option<Vec<u8>> {
     const COLOURS: [Rgba; 6] = [RIM, NORMAL, MARK, EDGE, [255, 140, 80, 255], [180, 160, 255, 255]];
-    let (zoom, unit) = scales(pictures);
+    let (zoom, unit) = scales(images);
     let s = (unit.round() as u32).max(1);
     let mut panels = Vec::new();
     for (k, view) in View::BOTH.iter().enumerate() {
-        let mut panel = Panel::new(pictures[k], *view, rig, zoom)?;
+        let mut panel = Panel::new(images[k], *view, rig, zoom)?;
         for (n, p) in found.iter().enumerate() {
             let colour = COLOURS.get(n % COLOURS.len()).copied().unwrap_or(RIM);
             if let Some(c) = p.contours.get(k) {
@@ -331,13 +331,13 @@ fn draw_view(
     plan: &Plan,
     k: usize,
     view: View,
-    picture: &Picture,
+    image: &GreyImage,
     rig: &RigFile,
     gripper: &GripperFile,
     zoom: f64,
     unit: f64,
 ) -> Option<Canvas> {
-    let mut panel = Panel::new(picture, view, rig, zoom)?;
+    let mut panel = Panel::new(image, view, rig, zoom)?;
     let rim = &plan.reconstruction.rim;
     let frame = object_frame(&plan.reconstruction);
     let opening = plan.file.opening_m;
@@ -378,7 +378,7 @@ fn draw_view(
     Some(panel.canvas)
 }
 
-/// The figures under the pictures, in columns of (name, value).
+/// The figures under the images, in columns of (name, value).
 fn caption(plan: &Plan) -> Vec<Vec<(&'static str, String)>> {
     let r = &plan.reconstruction;
     let o = &plan.file.object;

@@ -1,4 +1,4 @@
-//! The one-page report of a plan: the picture, the figures, the residuals along the contour, the ellipses of uncertainty. One file, no network.
+//! The one-page report of a plan: the image, the figures, the residuals along the contour, the ellipses of uncertainty. One file, no network.
 
 use crate::offline::contour::Contour;
 use crate::offline::plan::Plan;
@@ -17,15 +17,15 @@ svg{width:100%;height:auto}small{color:#57606a}code{font-size:.85em}\
 @media(prefers-color-scheme:dark){body{background:#0d1117;color:#e6edf3}td,th{border-color:#30363d}th,small{color:#8b949e}.note{background:#3a2f0b}}\
 @media(max-width:50rem){.two{grid-template-columns:1fr}}";
 
-/// The report as HTML; `picture` is the overlay's PNG.
-pub fn html(plan: &Plan, picture: Option<&[u8]>) -> String {
+/// The report as HTML; `image` is the overlay's PNG.
+pub fn html(plan: &Plan, image: Option<&[u8]>) -> String {
     let o = &plan.file.object;
     let r = &plan.reconstruction;
     let mut h = head(
         &format!("Grasp on a{} {}", if o.model.starts_with('e') { "n" } else { "" }, o.model.replace('-', " ")),
         plan.set_point.id,
         &plan.file.warnings,
-        picture.map(|png| (png, "both views with rim, normal, gripper and marks")),
+        image.map(|png| (png, "both views with rim, normal, gripper and marks")),
     );
     h += "<div class=two><div><h2>Rim</h2><table>";
     let mm = |v: f64| format!("{:.3} mm", v * 1e3);
@@ -76,11 +76,7 @@ pub fn html(plan: &Plan, picture: Option<&[u8]>) -> String {
         row(&mut h, "correspondence &delta;", &format!("{:.2e}", q.delta));
         row(&mut h, "rank-2 residue", &format!("{:.2e}", q.rank2_residue));
         row(&mut h, "vergence", &format!("{:.2}&deg;", q.vergence_deg));
-        row(
-            &mut h,
-            "minor axes in the pictures",
-            &format!("{:.1} px, {:.1} px", q.minor_axis_px[0], q.minor_axis_px[1]),
-        );
+        row(&mut h, "minor axes in the images", &format!("{:.1} px, {:.1} px", q.minor_axis_px[0], q.minor_axis_px[1]));
     }
     for (name, k) in [("left contour", 0), ("right contour", 1)] {
         if let Some(c) = plan.contours.get(k) {
@@ -145,12 +141,12 @@ pub fn html(plan: &Plan, picture: Option<&[u8]>) -> String {
     h
 }
 
-/// The top of a report: title, warnings and the picture (a PNG's bytes) with what it shows in words.
+/// The top of a report: title, warnings and the image (a PNG's bytes) with what it shows in words.
 pub(in crate::offline) fn head(
     title: &str,
     set_point: u64,
     warnings: &[String],
-    picture: Option<(&[u8], &str)>,
+    image: Option<(&[u8], &str)>,
 ) -> String {
     let mut h = String::new();
     // Writing into a string cannot fail.
@@ -163,7 +159,7 @@ pub(in crate::offline) fn head(
     for w in warnings {
         let _ = write!(h, "<div class=note>{}</div>", escape(w));
     }
-    if let Some((png, alt)) = picture {
+    if let Some((png, alt)) = image {
         let _ = write!(h, "<p><img alt=\"{alt}\" src=\"data:image/png;base64,{}\">", STANDARD.encode(png));
     }
     h

@@ -26,7 +26,7 @@ pub struct IdealEdge {
     pub towards_bright: Pixel,
 }
 
-/// The arcs of a picture.
+/// The arcs of an image.
 #[derive(Clone, Debug)]
 pub struct Arcs {
     /// All arcs, in raster order of their first point.
@@ -37,7 +37,7 @@ pub struct Arcs {
     pub ideal: IdealEdges,
 }
 
-/// The edge points of a picture in ideal pixels. Most are never asked for, so each is undistorted when it is for the first time.
+/// The edge points of an image in ideal pixels. Most are never asked for, so each is undistorted when it is for the first time.
 #[derive(Clone, Debug)]
 pub struct IdealEdges {
     lens: Lens,
@@ -74,7 +74,7 @@ impl IdealEdges {
 }
 
 impl Arcs {
-    /// Links and cuts the edge points of a picture.
+    /// Links and cuts the edge points of an image.
     pub fn link(map: &EdgeMap, lens: &Lens) -> Self {
         let (next, previous) = links(map);
         let n = map.edges().len();
@@ -216,7 +216,7 @@ fn links(map: &EdgeMap) -> (Vec<u32>, Vec<u32>) {
 mod tests {
     use super::*;
     use crate::offline::edges::EdgeMap;
-    use crate::offline::edges::picture::Picture;
+    use crate::offline::edges::grey_image::GreyImage;
     use graspd_rt::geom::{Camera, Distortion};
 
     #[test]
@@ -234,7 +234,7 @@ mod tests {
             let data = (0..160 * 160)
                 .map(|i| (60.0 + 100.0 / (1.0 + (-2.0 * f((i % 160) as f64, (i / 160) as f64)).exp())) as u8)
                 .collect();
-            let map = EdgeMap::detect(&Picture::new(160, 160, data).unwrap());
+            let map = EdgeMap::detect(&GreyImage::new(160, 160, data).unwrap());
             Arcs::link(&map, &Lens::new(&cam))
         };
         let disc = draw(&|x, y| 50.0 - (x - 80.0).hypot(y - 79.0));

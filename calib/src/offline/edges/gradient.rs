@@ -1,9 +1,9 @@
-//! The gradient of a smoothed picture, row by row.
+//! The gradient of a smoothed image, row by row.
 //!
-//! Whole pictures of intermediate results would be tens of megabytes that are touched once: clearing and faulting in their pages costs more than the
+//! Whole images of intermediate results would be tens of megabytes that are touched once: clearing and faulting in their pages costs more than the
 //! arithmetic. So only the rows that a row's neighbourhood needs are kept, and they stay in the cache.
 
-use crate::offline::edges::picture::Picture;
+use crate::offline::edges::grey_image::GreyImage;
 use crate::offline::edges::{RADIUS, SCALE};
 
 /// Samples of a kernel.
@@ -11,7 +11,7 @@ const TAPS: usize = 2 * RADIUS + 1;
 /// Pixels that are worked on together: their sums stay in registers.
 const LANES: usize = 16;
 
-/// First derivatives of the smoothed picture along one row, from column [`RADIUS`] on; nearer to the border there are none.
+/// First derivatives of the smoothed image along one row, from column [`RADIUS`] on; nearer to the border there are none.
 #[derive(Clone, Debug, Default)]
 pub(super) struct GradientRow {
     pub(super) x: Vec<f32>,
@@ -20,16 +20,16 @@ pub(super) struct GradientRow {
     pub(super) square: Vec<f32>,
 }
 
-/// Walks down a picture.
+/// Walks down an image.
 pub(super) struct GradientRows<'a> {
-    picture: &'a Picture,
+    image: &'a GreyImage,
     smooth: [f32; TAPS],
     slope: [f32; TAPS],
     /// Grey values of a row, with room for the last lanes.
     grey: Vec<f32>,
     /// The last rows smoothed and derived along x; row `y` at `y % TAPS`.
     across: [(Vec<f32>, Vec<f32>); TAPS],
-    /// How many rows of the picture have been taken.
+    /// How many rows of the image have been taken.
     taken: usize,
     /// The last three gradient rows; row `y` at `y % 3`.
     rows: [GradientRow; 3],
@@ -38,9 +38,9 @@ pub(super) struct GradientRows<'a> {
 }
 
 impl<'a> GradientRows<'a> {
-    /// `None` where the picture is too small to have any.
-    pub(super) fn new(picture: &'a Picture) -> Option<Self> {
-        let (w, h) = (picture.width(), picture.height());
+    /// `None` where the image is too small to have any.
+    pub(super) fn new(image: &'a GreyImage) -> Option<Self> {
+        let (w, h) = (image.width(), image.height());
         if w < TAPS + 2 || h < TAPS + 2 {
             return None;
         }
@@ -50,7 +50,7 @@ impl<'a> GradientRows<'a> {
         let zero = || vec![0.0f32; room];
         let row = || GradientRow { x: zero(), y: zero(), square: vec![0.0; columns] };
         let mut rows = Self {
-            picture,
+            image,
             smooth,
             slope,
             grey: vec![0.0; room + 2 * RADIUS],
@@ -66,7 +66,7 @@ impl<'a> GradientRows<'a> {
     /// The next row's number with the gradient above, in, and below it. Rows beyond the last are zero, like those before the first.
     pub(super) fn step(&mut self) -> Option<(usize, [&GradientRow; 3])> {
         let y = self.next;
-        if y + RADIUS >= self.picture.height() {
+        if y + RADIUS >= self.image.height() {
             return None;
         }
         self.next += 1;
@@ -85,12 +85,12 @@ impl<'a> GradientRows<'a> {
     /// Computes the gradient of row `y` into its slot.
     fn make(&mut self, y: usize) {
         let Some(out) = self.rows.get_mut(y % 3) else { return };
-        if y + RADIUS >= self.picture.height() {
+        if y + RADIUS >= self.image.height() {
             out.square.fill(0.0);
             return;
         }
         while self.taken <= y + RADIUS {
-            for (g, v) in self.grey.iter_mut().zip(self.picture.row(self.taken)) {
+            for (g, v) in self.grey.iter_mut().zip(self.image.row(self.taken)) {
                 *g = f32::from(*v);
             }
             if let Some((s, t)) = self.across.get_mut(self.taken % TAPS) {

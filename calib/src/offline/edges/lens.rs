@@ -1,10 +1,10 @@
-//! Between the pixels of a picture and those of the ideal pinhole in which conics are conics.
+//! Between the pixels of an image and those of the ideal pinhole in which conics are conics.
 
 use crate::offline::rim::model::Projection;
 use graspd_rt::geom::{Camera, Distortion, Pixel, Rig, View};
 use nalgebra::{Matrix3, Matrix3x4};
 
-/// A camera as the map between *raw* pixels (where the picture has them) and *ideal* ones (same focal lengths, no distortion).
+/// A camera as the map between *raw* pixels (where the image has them) and *ideal* ones (same focal lengths, no distortion).
 #[derive(Clone, Copy, Debug)]
 pub struct Lens {
     camera: Camera,

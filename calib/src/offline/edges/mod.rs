@@ -8,12 +8,12 @@
 
 pub mod arcs;
 mod gradient;
+pub mod grey_image;
 pub mod lens;
-pub mod picture;
 pub mod sharpen;
 
 use crate::offline::edges::gradient::{GradientRow, GradientRows};
-use crate::offline::edges::picture::Picture;
+use crate::offline::edges::grey_image::GreyImage;
 use graspd_rt::geom::Pixel;
 
 /// Standard deviation of the Gaussian whose derivatives are taken, pixels.
@@ -35,7 +35,7 @@ pub struct Edge {
 /// Pixels of a row that share an entry of the index.
 const BLOCK: usize = 16;
 
-/// Every edge point of a picture, and which ones lie near a place.
+/// Every edge point of an image, and which ones lie near a place.
 #[derive(Clone, Debug)]
 pub struct EdgeMap {
     width: usize,
@@ -44,20 +44,20 @@ pub struct EdgeMap {
     /// Column of the pixel that each edge point was found in.
     columns: Vec<u32>,
     /// Index of the first edge point in or after each block, block by block in raster order, and the number of points at the end.
-    /// A picture has few edge points: a word for each pixel would be as large as all the rest, and cost its page faults.
+    /// An image has few edge points: a word for each pixel would be as large as all the rest, and cost its page faults.
     starts: Vec<u32>,
     noise: f64,
 }
 
 impl EdgeMap {
-    /// Detects the edges of a whole picture.
-    pub fn detect(picture: &Picture) -> Self {
-        let noise = picture.noise();
+    /// Detects the edges of a whole image.
+    pub fn detect(image: &GreyImage) -> Self {
+        let noise = image.noise();
         // The gradient's own noise is noise / (sqrt(8 pi) SCALE^2); five times that is left to chance once in a million pixels.
         let threshold = (5.0 * noise / (8.0 * std::f64::consts::PI).sqrt() / (SCALE * SCALE)).max(1.2) as f32;
-        let (w, h) = (picture.width(), picture.height());
+        let (w, h) = (image.width(), image.height());
         let mut map = Self { width: w, height: h, edges: Vec::new(), columns: Vec::new(), starts: Vec::new(), noise };
-        if let Some(mut rows) = GradientRows::new(picture) {
+        if let Some(mut rows) = GradientRows::new(image) {
             while let Some((y, three)) = rows.step() {
                 map.scan(y, three, threshold);
             }
@@ -112,12 +112,12 @@ impl EdgeMap {
         &self.edges
     }
 
-    /// Width of the picture, pixels.
+    /// Width of the image, pixels.
     pub fn width(&self) -> usize {
         self.width
     }
 
-    /// Height of the picture, pixels.
+    /// Height of the image, pixels.
     pub fn height(&self) -> usize {
         self.height
     }
@@ -156,7 +156,7 @@ impl EdgeMap {
         }
     }
 
-    /// Columns from and to, and rows, of the pixels at most `radius` from a rectangle; no rows where the picture does not reach.
+    /// Columns from and to, and rows, of the pixels at most `radius` from a rectangle; no rows where the image does not reach.
     fn rows_within(&self, first: Pixel, last: Pixel, radius: i32) -> ((u32, u32), std::ops::Range<usize>) {
         let span = |first: f64, last: f64, size: usize| {
             let end = i32::try_from(size).unwrap_or(i32::MAX) - 1;
@@ -208,11 +208,11 @@ impl Refined {
 
 /// Steps from an edge point to the place where the second derivative along its gradient vanishes.
 ///
-/// `None` when there is no edge within a pixel and a half, or the picture ends. `noise` is in grey levels.
-pub fn refine(picture: &Picture, start: &Edge, noise: f64) -> Option<Refined> {
+/// `None` when there is no edge within a pixel and a half, or the image ends. `noise` is in grey levels.
+pub fn refine(image: &GreyImage, start: &Edge, noise: f64) -> Option<Refined> {
     let mut p = start.at;
     for _ in 0..8 {
-        let d = Derivatives::at(picture, p)?;
+        let d = Derivatives::at(image, p)?;
         let g = Pixel::new(d.x, d.y);
         let m = g.norm();
         // The direction may turn with the better place, not swing to another edge.
@@ -246,7 +246,7 @@ pub fn refine(picture: &Picture, start: &Edge, noise: f64) -> Option<Refined> {
     None
 }
 
-/// Derivatives of the smoothed picture at a sub-pixel place.
+/// Derivatives of the smoothed image at a sub-pixel place.
 struct Derivatives {
     x: f64,
     y: f64,
@@ -260,10 +260,10 @@ struct Derivatives {
 }
 
 impl Derivatives {
-    fn at(picture: &Picture, p: Pixel) -> Option<Self> {
+    fn at(image: &GreyImage, p: Pixel) -> Option<Self> {
         const N: usize = 2 * RADIUS + 3;
         let r = (RADIUS + 1) as f64;
-        if !picture.contains(p, r + 1.0) {
+        if !image.contains(p, r + 1.0) {
             return None;
         }
         let (x0, y0) = ((p.x.round() - r) as usize, (p.y.round() - r) as usize);
@@ -271,7 +271,7 @@ impl Derivatives {
         // Rows first: the four derivatives along x of every row, then along y.
         let mut d = [[0.0f64; 4]; 4];
         for (j, wv) in kv.iter().enumerate() {
-            let row = picture.row(y0 + j).get(x0..x0 + N)?;
+            let row = image.row(y0 + j).get(x0..x0 + N)?;
             let mut a = [0.0f64; 4];
             for (v, wu) in row.iter().zip(&ku) {
                 let v = f64::from(*v);
@@ -305,7 +305,7 @@ mod tests {
     use rand_distr::{Distribution, Normal};
 
     /// A sharp disc, blurred in the plane by a Gaussian lens of 0.6 px and integrated over pixels, by dense sampling.
-    fn disc(side: usize, c: Pixel, radius: f64, noise: f64, seed: u64) -> Picture {
+    fn disc(side: usize, c: Pixel, radius: f64, noise: f64, seed: u64) -> GreyImage {
         const SUB: usize = 6;
         let n = side * SUB;
         let place = |k: usize| (k as f64 + 0.5) / SUB as f64 - 0.5;
@@ -346,15 +346,15 @@ mod tests {
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
         let normal = Normal::new(0.0, noise.max(1e-9)).unwrap();
         let grey = |v: &f32| (60.0 + 130.0 * f64::from(*v) + normal.sample(&mut rng)).round().clamp(0.0, 255.0) as u8;
-        Picture::new(side, side, twice.iter().map(grey).collect()).unwrap()
+        GreyImage::new(side, side, twice.iter().map(grey).collect()).unwrap()
     }
 
-    fn errors(picture: &Picture, c: Pixel, radius: f64) -> Vec<(f64, f64)> {
-        let map = EdgeMap::detect(picture);
+    fn errors(image: &GreyImage, c: Pixel, radius: f64) -> Vec<(f64, f64)> {
+        let map = EdgeMap::detect(image);
         map.edges()
             .iter()
             .filter(|e| ((e.at - c).norm() - radius).abs() < 2.0)
-            .filter_map(|e| refine(picture, e, map.noise()))
+            .filter_map(|e| refine(image, e, map.noise()))
             .map(|r| {
                 let q = r.straightened((r.at - c).normalize(), radius);
                 ((q.at - c).norm() - radius, q.sigma)

@@ -4,7 +4,7 @@
 //! foreshortened, which tips the plane fitted to it. So the slope across the edge is sampled and taken apart into blurred steps of one known width, as many
 //! as it takes; the step in the middle is the edge. Its standard deviation is that of the joint fit, which grows where neighbours cannot be told apart.
 
-use crate::offline::edges::picture::Picture;
+use crate::offline::edges::grey_image::GreyImage;
 use crate::offline::edges::{Edge, EdgeMap, Refined, refine};
 use graspd_rt::geom::Pixel;
 use nalgebra::{SMatrix, SVector};
@@ -36,19 +36,19 @@ const CROWDED_PX: f64 = 0.2;
 /// A further step is looked for where the slope left over is larger than this part of the main step's.
 const LEFT_OVER: f64 = 0.06;
 
-/// Standard deviation of a sharp edge's picture (lens and pixel together), pixels: the median over the strongest edges of a picture.
-pub fn lens_blur(picture: &Picture, map: &EdgeMap) -> f64 {
+/// Standard deviation of a sharp edge's image (lens and pixel together), pixels: the median over the strongest edges of an image.
+pub fn lens_blur(image: &GreyImage, map: &EdgeMap) -> f64 {
     let mut strongest: Vec<&Edge> = map.edges().iter().collect();
     strongest.sort_by(|a, b| {
         b.strength.total_cmp(&a.strength).then(a.at.y.total_cmp(&b.at.y)).then(a.at.x.total_cmp(&b.at.x))
     });
-    // One in several, so that a single long edge does not speak for the picture.
+    // One in several, so that a single long edge does not speak for the image.
     let step = (strongest.len() / 5 / 400).max(1);
     let mut widths: Vec<f64> = strongest
         .iter()
         .take(strongest.len() / 5 + 50)
         .step_by(step)
-        .filter_map(|e| refine(picture, e, map.noise()))
+        .filter_map(|e| refine(image, e, map.noise()))
         .map(|r| r.width * r.width - crate::offline::edges::SCALE * crate::offline::edges::SCALE)
         .collect();
     widths.sort_by(f64::total_cmp);
@@ -74,12 +74,12 @@ impl Fit {
     }
 }
 
-/// Finds the place of an edge among its neighbours. `blur` is the picture's [`lens_blur`]; `noise` is in grey levels.
+/// Finds the place of an edge among its neighbours. `blur` is the image's [`lens_blur`]; `noise` is in grey levels.
 ///
 /// `None` where the edge is not a step that can be told from its surroundings.
-pub fn sharpen(picture: &Picture, start: &Refined, noise: f64, blur: f64) -> Option<Refined> {
+pub fn sharpen(image: &GreyImage, start: &Refined, noise: f64, blur: f64) -> Option<Refined> {
     let n = start.towards_bright;
-    let slope = slopes(picture, start.at, n)?;
+    let slope = slopes(image, start.at, n)?;
     let width = SCALE.hypot(blur);
     let peak = slope.get(REACH as usize).copied()?;
     if !(peak > 3.0 * SLOPE_NOISE * noise) {
@@ -157,14 +157,14 @@ pub fn sharpen(picture: &Picture, start: &Refined, noise: f64, blur: f64) -> Opt
     })
 }
 
-/// Slopes across an edge at every half pixel, [`REACH`] of them to each side, averaged along it; `None` at the picture's border.
-pub(in crate::offline) fn slopes(picture: &Picture, at: Pixel, n: Pixel) -> Option<[f64; SLOPES]> {
+/// Slopes across an edge at every half pixel, [`REACH`] of them to each side, averaged along it; `None` at the image's border.
+pub(in crate::offline) fn slopes(image: &GreyImage, at: Pixel, n: Pixel) -> Option<[f64; SLOPES]> {
     let along = Pixel::new(-n.y, n.x);
     let mut slope = [0.0; SLOPES];
     for (k, s) in slope.iter_mut().enumerate() {
         let t = 0.5 * (k as f64 - f64::from(REACH));
         for a in ASIDE {
-            *s += slope_at(picture, at + n * t + along * a, n)?;
+            *s += slope_at(image, at + n * t + along * a, n)?;
         }
         *s /= ASIDE.len() as f64;
     }
@@ -294,18 +294,18 @@ fn solve(slope: &[f64; SLOPES], width: f64, fit: &mut Fit) -> Option<()> {
     Some(())
 }
 
-/// Slope of the smoothed picture along a direction at a sub-pixel place.
-fn slope_at(picture: &Picture, p: Pixel, n: Pixel) -> Option<f64> {
+/// Slope of the smoothed image along a direction at a sub-pixel place.
+fn slope_at(image: &GreyImage, p: Pixel, n: Pixel) -> Option<f64> {
     const N: usize = 2 * RADIUS + 1;
     let r = RADIUS as f64;
-    if !picture.contains(p, r + 1.0) {
+    if !image.contains(p, r + 1.0) {
         return None;
     }
     let (x0, y0) = ((p.x.round() - r) as usize, (p.y.round() - r) as usize);
     let (ku, kv) = (kernel(x0 as f64 - p.x), kernel(y0 as f64 - p.y));
     let (mut dx, mut dy) = (0.0, 0.0);
     for (j, (gv, sv)) in kv.iter().enumerate() {
-        let row = picture.row(y0 + j).get(x0..x0 + N)?;
+        let row = image.row(y0 + j).get(x0..x0 + N)?;
         let (mut smooth, mut steep) = (0.0, 0.0);
         for (v, (g, s)) in row.iter().zip(&ku) {
             let v = f64::from(*v);
@@ -344,7 +344,7 @@ mod tests {
     use rand_distr::{Distribution, Normal};
 
     /// Straight stripes `(from, to, grey)` across a direction, blurred by a Gaussian lens and integrated over pixels.
-    fn stripes(n: Pixel, edges: &[(f64, f64)], blur: f64, noise: f64, seed: u64) -> Picture {
+    fn stripes(n: Pixel, edges: &[(f64, f64)], blur: f64, noise: f64, seed: u64) -> GreyImage {
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
         let normal = Normal::new(0.0, noise.max(1e-9)).unwrap();
         // The Gaussian step as a table of its running sum.
@@ -373,10 +373,10 @@ mod tests {
                 (v + normal.sample(&mut rng)).round().clamp(0.0, 255.0) as u8
             })
             .collect();
-        Picture::new(48, 48, data).unwrap()
+        GreyImage::new(48, 48, data).unwrap()
     }
 
-    fn place(p: &Picture, n: Pixel, noise: f64, blur: f64) -> Option<(f64, f64)> {
+    fn place(p: &GreyImage, n: Pixel, noise: f64, blur: f64) -> Option<(f64, f64)> {
         let start = Refined { at: Pixel::new(24.0, 24.0), towards_bright: n, sigma: 0.1, width: 1.2 };
         let r = sharpen(p, &start, noise, blur)?;
         Some(((r.at - Pixel::new(24.0, 24.0)).dot(&n), r.sigma))

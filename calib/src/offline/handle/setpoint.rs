@@ -1,6 +1,6 @@
-//! The marks at a goal: which of them each camera sees, how well, and where in its picture.
+//! The marks at a goal: which of them each camera sees, how well, and where in its image.
 //!
-//! A mark counts where it faces the camera by more than ten degrees, lies inside the picture by a border, and neither the gripper's own boxes nor
+//! A mark counts where it faces the camera by more than ten degrees, lies inside the image by a border, and neither the gripper's own boxes nor
 //! the object stand between. Its worth is the solid angle of its disc (section 3.2, errata D); a hidden one is worth nothing.
 
 use crate::files::{GripperFile, OrientedBox};
@@ -113,7 +113,7 @@ impl<'a> Scene<'a> {
         out
     }
 
-    /// Pixel of a mark that faces the camera and lies in the picture.
+    /// Pixel of a mark that faces the camera and lies in the image.
     fn pixel(&self, view: View, mark: &Mark, pose: &Pose, eye_in_gripper: &Vec3) -> Option<Pixel> {
         let v = (eye_in_gripper - mark.position).try_normalize(1e-9)?;
         if v.dot(&mark.normal) < MIN_COSINE {

@@ -15,14 +15,14 @@ pub struct FlatMark {
     pub area: f64,
 }
 
-/// A camera as visibility needs it: projection, its centre, picture size in pixels.
+/// A camera as visibility needs it: projection, its centre, image size in pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Eye {
     /// Projection matrix.
     pub p: Projection,
     /// Projection centre.
     pub centre: Vector3<f64>,
-    /// Picture width and height, pixels.
+    /// Image width and height, pixels.
     pub size: [f64; 2],
 }
 
@@ -36,7 +36,7 @@ impl Eye {
 /// Steepest incidence at which a mark still counts as seen: 80 degrees.
 pub const MIN_COSINE: f64 = 0.173_648_177_666_930_33;
 
-/// Distance from the picture's border that a mark must keep, pixels.
+/// Distance from the image's border that a mark must keep, pixels.
 pub const BORDER_PX: f64 = 10.0;
 
 /// Solid angle (sr) of a small flat mark: `area max(0, cos) / d^2`. A disc's exact value differs by less than 0.1 % for 12 mm at 1.4 m.
@@ -46,7 +46,7 @@ pub fn solid_angle(centre: &Vector3<f64>, normal: &Vector3<f64>, area: f64, eye:
     area * (v.dot(normal) / d).max(0.0) / (d * d)
 }
 
-/// Sum of the marks' solid angles, and whether every mark faces the camera and lies inside the picture.
+/// Sum of the marks' solid angles, and whether every mark faces the camera and lies inside the image.
 pub fn visibility(world_from_gripper: &Isometry3<f64>, marks: &[FlatMark], eye: &Eye) -> (f64, bool) {
     let mut sum = 0.0;
     let mut all = true;
@@ -59,7 +59,7 @@ pub fn visibility(world_from_gripper: &Isometry3<f64>, marks: &[FlatMark], eye: 
     (sum, all)
 }
 
-/// Whether a mark faces a camera by more than 10 degrees and projects inside the picture.
+/// Whether a mark faces a camera by more than 10 degrees and projects inside the image.
 pub fn seen(x: &Vector3<f64>, normal: &Vector3<f64>, eye: &Eye) -> bool {
     let v = (eye.centre - x).normalize();
     let u: Vector2<f64> = project(&eye.p, x);

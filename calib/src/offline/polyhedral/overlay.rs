@@ -1,4 +1,4 @@
-//! The picture of a polyhedral plan: both views, the mesh's edges as they should lie on the part, the predicted gripper and marks, the picks.
+//! The image of a polyhedral plan: both views, the mesh's edges as they should lie on the part, the predicted gripper and marks, the picks.
 
 use super::mesh::Mesh;
 use super::plan::{MeshPlan, Placed, Survey};
@@ -6,7 +6,7 @@ use super::topology::edges;
 use crate::files::{GripperFile, RigFile};
 use crate::offline::drawing::canvas::{Face, Rgba};
 use crate::offline::drawing::overlay::{BRIGHT, CLICK, DIM, MARK, NORMAL, Panel, RIM, boxes, scales, sheet};
-use crate::offline::edges::picture::Picture;
+use crate::offline::edges::grey_image::GreyImage;
 use graspd_rt::geom::{Pixel, Pose, Vec3, View};
 use nalgebra::Point3;
 
@@ -22,31 +22,31 @@ struct Line {
     hidden: bool,
 }
 
-/// Draws a plan; the bytes of a PNG file. Without pictures the views are empty. `None` only when the pictures are too large to be drawn.
+/// Draws a plan; the bytes of a PNG file. Without images the views are empty. `None` only when the images are too large to be drawn.
 pub fn draw(
     plan: &MeshPlan,
     survey: &Survey<'_>,
     mesh: &Mesh,
     placed: &Placed,
-    pictures: Option<[&Picture; 2]>,
+    images: Option<[&GreyImage; 2]>,
     rig: &RigFile,
     gripper: &GripperFile,
 ) -> Option<Vec<u8>> {
     let empty = View::BOTH.map(|v| {
         let c = rig.rig.camera(v);
         let (w, h) = (c.width as usize, c.height as usize);
-        Picture::new(w, h, vec![40; w * h])
+        GreyImage::new(w, h, vec![40; w * h])
     });
-    let pictures = match (pictures, &empty) {
+    let images = match (images, &empty) {
         (Some(p), _) => p,
         (None, [Some(l), Some(r)]) => [l, r],
         _ => return None,
     };
-    let cuts = close_up(plan, mesh, placed, pictures, rig, gripper);
-    let cropped = [cuts[0].picture(pictures[0])?, cuts[1].picture(pictures[1])?];
+    let cuts = close_up(plan, mesh, placed, images, rig, gripper);
+    let cropped = [cuts[0].image(images[0])?, cuts[1].image(images[1])?];
     let (zoom, unit) = scales([&cropped[0], &cropped[1]]);
     let mut panels = Vec::new();
-    for (view, (whole, cut)) in View::BOTH.into_iter().zip(pictures.into_iter().zip(cuts)) {
+    for (view, (whole, cut)) in View::BOTH.into_iter().zip(images.into_iter().zip(cuts)) {
         let near = cut.rig(view, rig);
         let mut panel = Panel::new(&cropped[view.index()], view, &near, zoom)?;
         draw_view(&mut panel, view, plan, survey, mesh, placed, &near, gripper, unit, &cut);
@@ -82,9 +82,9 @@ struct Cut {
 }
 
 impl Cut {
-    fn picture(&self, whole: &Picture) -> Option<Picture> {
+    fn image(&self, whole: &GreyImage) -> Option<GreyImage> {
         let rows = (self.y..self.y + self.height).filter_map(|y| whole.row(y).get(self.x..self.x + self.width));
-        Picture::new(self.width, self.height, rows.flatten().copied().collect())
+        GreyImage::new(self.width, self.height, rows.flatten().copied().collect())
     }
 
     fn offset(&self) -> Pixel {
@@ -102,7 +102,7 @@ impl Cut {
     }
 }
 
-/// The cut's sides are this much longer than what has to be in it, and at least this part of the picture; a larger one is the whole picture.
+/// The cut's sides are this much longer than what has to be in it, and at least this part of the image; a larger one is the whole image.
 const ROOM: f64 = 1.25;
 const LEAST_CUT: f64 = 0.12;
 const MOST_CUT: f64 = 0.7;
@@ -112,7 +112,7 @@ fn close_up(
     plan: &MeshPlan,
     mesh: &Mesh,
     placed: &Placed,
-    whole: [&Picture; 2],
+    whole: [&GreyImage; 2],
     rig: &RigFile,
     gripper: &GripperFile,
 ) -> [Cut; 2] {
@@ -149,7 +149,7 @@ fn close_up(
 }
 
 /// The whole view, small in a corner, with a frame round what is drawn.
-fn inset(panel: &mut Panel<'_>, whole: &Picture, view: View, rig: &RigFile, cut: &Cut, unit: f64) {
+fn inset(panel: &mut Panel<'_>, whole: &GreyImage, view: View, rig: &RigFile, cut: &Cut, unit: f64) {
     let (w, h) = (f64::from(panel.canvas.pixmap.width()), f64::from(panel.canvas.pixmap.height()));
     let zoom = 0.22 * w / whole.width() as f64;
     let Some(mut small) = Panel::new(whole, view, rig, zoom) else { return };
@@ -273,7 +273,7 @@ fn normals(mesh: &Mesh) -> Vec<Option<Vec3>> {
     out.iter().map(|n| n.try_normalize(0.0)).collect()
 }
 
-/// The figures under the pictures.
+/// The figures under the images.
 fn caption(plan: &MeshPlan, survey: &Survey<'_>, placed: &Placed) -> Vec<Vec<(&'static str, String)>> {
     let mm = |v: f64| format!("{:.1}", v * 1e3);
     let (o, m, j) = (&plan.file.object, &placed.record, &plan.chosen);

@@ -237,7 +237,7 @@ impl Survey<'_> {
             pregrasp: goal_record(&scene.goal(&pregrasp), options.pregrasp),
             grasp: goal_record(&scene.goal(&grasp), 0.0),
             path,
-            pictures: None,
+            images: None,
             selection: None,
             edges: None,
             cones: None,

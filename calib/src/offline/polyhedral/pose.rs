@@ -1,4 +1,4 @@
-//! Where a mesh stands, from points of it that were picked in both pictures.
+//! Where a mesh stands, from points of it that were picked in both images.
 
 use crate::offline::edges::lens::Lens;
 use graspd_rt::geom::{Pixel, Pose, Rig, Vec3, View, exp_twist};
@@ -9,9 +9,9 @@ use nalgebra::{Matrix3, Matrix6, Point3, UnitQuaternion, Vector6};
 pub struct Picked {
     /// The point in the mesh's frame, metres.
     pub point: Vec3,
-    /// Its pixel in the left picture.
+    /// Its pixel in the left image.
     pub left: Pixel,
-    /// Its pixel in the right picture.
+    /// Its pixel in the right image.
     pub right: Pixel,
 }
 

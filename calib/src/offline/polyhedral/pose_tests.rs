@@ -155,7 +155,7 @@ fn what_is_wrong_with_all_picks_is_said() {
                 other => panic!("{seed}: {other:?}"),
             }
         }
-        // Left and right pictures exchanged: every pair of rays diverges, or nothing fits.
+        // Left and right images exchanged: every pair of rays diverges, or nothing fits.
         let turned: Vec<Picked> = good.iter().map(|p| Picked { left: p.right, right: p.left, ..*p }).collect();
         assert!(fit(&rig(), &turned, 5.0).is_err());
         // Two wrong of six or more are both named.

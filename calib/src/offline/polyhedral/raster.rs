@@ -1,4 +1,4 @@
-//! The picture of a face from straight above, and the outline of what two such pictures have in common.
+//! The image of a face from straight above, and the outline of what two such images have in common.
 
 use super::faces::Face;
 use super::mesh::Mesh;

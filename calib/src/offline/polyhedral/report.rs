@@ -1,4 +1,4 @@
-//! The one-page report of a plan on a mesh: picture, pose with its doubt, what the picks say, the ellipses of uncertainty, every handle. One file.
+//! The one-page report of a plan on a mesh: image, pose with its doubt, what the picks say, the ellipses of uncertainty, every handle. One file.
 
 use super::filter::Judged;
 use super::plan::{MeshPlan, Placed, Survey};
@@ -12,11 +12,11 @@ use std::fmt::Write;
 /// Handles listed at most; a scan of a round part has thousands.
 const MOST_ROWS: usize = 400;
 
-/// The report as HTML; `picture` is the overlay's PNG.
-pub fn html(plan: &MeshPlan, survey: &Survey<'_>, placed: &Placed, rig: &RigFile, picture: Option<&[u8]>) -> String {
+/// The report as HTML; `image` is the overlay's PNG.
+pub fn html(plan: &MeshPlan, survey: &Survey<'_>, placed: &Placed, rig: &RigFile, image: Option<&[u8]>) -> String {
     let o = &plan.file.object;
-    let picture = picture.map(|png| (png, "both views with the part's edges, the way in, gripper and marks"));
-    let mut h = head("Grasp on a mesh", plan.set_point.id, &plan.file.warnings, picture);
+    let image = image.map(|png| (png, "both views with the part's edges, the way in, gripper and marks"));
+    let mut h = head("Grasp on a mesh", plan.set_point.id, &plan.file.warnings, image);
     h += "<div class=two><div><h2>Part</h2><table>";
     part(&mut h, placed);
     h += "</table></div><div><h2>Handle</h2><table>";
@@ -151,7 +151,7 @@ fn picks(h: &mut String, placed: &Placed, rig: &RigFile) {
     h.push_str("</table>");
 }
 
-/// Differences in pixels as numbered dots round a cross; down is down as in the picture.
+/// Differences in pixels as numbered dots round a cross; down is down as in the image.
 fn scatter(name: &str, points: &[(usize, Pixel)], rms: f64) -> String {
     let largest = points.iter().map(|(_, p)| p.x.abs().max(p.y.abs())).fold(1.2 * rms, f64::max).max(0.02) * 1.15;
     let Cross { svg: mut s, scale, middle: [cx, cy] } =

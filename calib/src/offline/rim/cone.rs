@@ -1,4 +1,4 @@
-//! The projective cone of a picture's conic, `Q = P^T C P` (section 4.1), in a frame in which its numbers mean something.
+//! The projective cone of an image's conic, `Q = P^T C P` (section 4.1), in a frame in which its numbers mean something.
 //!
 //! Errata B8: with the image centred on the ellipse and the world centred on the rim with the rim's size as unit, both cones are about
 //! `x^2 + y^2 - 1` and the residues of the pencil are comparable between scenes.
@@ -90,7 +90,7 @@ pub struct ConePair {
 }
 
 impl ConePair {
-    /// Builds both cones from the pictures' conics.
+    /// Builds both cones from the images' conics.
     pub fn new(c: [&Matrix3<f64>; 2], p: [&Projection; 2]) -> Result<Self, Refusal> {
         let o = check_cameras(p[0], p[1])?;
         let e = ellipses(c)?;

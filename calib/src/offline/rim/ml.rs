@@ -1,6 +1,6 @@
 //! The maximum-likelihood circle or ellipse over both views' edge points, with its covariance.
 //!
-//! Minimises the sum of squared Sampson distances in both pictures over the rim in space: 6 parameters for a circle, 8 for an ellipse.
+//! Minimises the sum of squared Sampson distances in both images over the rim in space: 6 parameters for a circle, 8 for an ellipse.
 //! The chart is local: centre and shape in units of the rim's size, the normal turned about the plane's own axes, so that neither a
 //! circle (equal axes) nor any direction of the normal is a singular point.
 
@@ -92,7 +92,7 @@ impl TwoViews {
         self.len() == 0
     }
 
-    /// Fits a circle or an ellipse from a start; any start whose picture overlaps the points will do.
+    /// Fits a circle or an ellipse from a start; any start whose image overlaps the points will do.
     pub fn fit(&self, start: &Rim, model: RimModel) -> Result<MlFit, Refusal> {
         let problem = RimProblem::new(self, start, model);
         let state = problem.start(start);
@@ -117,7 +117,7 @@ impl TwoViews {
     }
 }
 
-/// Conic of a rim's picture, pixels, oriented.
+/// Conic of a rim's image, pixels, oriented.
 pub fn image_conic(p: &Projection, rim: &Rim) -> Matrix3<f64> {
     let m = p.fixed_view::<3, 3>(0, 0);
     let last = m * rim.centre + p.column(3);
@@ -171,7 +171,7 @@ impl<'a> RimProblem<'a> {
         State { centre: (rim.centre - self.origin) / self.unit, e1, e2, n, s }
     }
 
-    /// Plane-to-picture matrix of a view: the unit circle's coordinates to the cloud's frame.
+    /// Plane-to-image matrix of a view: the unit circle's coordinates to the cloud's frame.
     fn homography(&self, k: usize, x: &State) -> Matrix3<f64> {
         let m = self.p[k].fixed_view::<3, 3>(0, 0);
         let (u, v) = (m * x.e1, m * x.e2);
@@ -294,7 +294,7 @@ impl Problem<8> for RimProblem<'_> {
     }
 
     fn cost(&self, x: &State) -> Option<f64> {
-        // A shape that has turned inside out is the same picture with a wrong name.
+        // A shape that has turned inside out is the same image with a wrong name.
         if !(x.s.determinant() > 0.0 && x.s[(0, 0)] > 0.0) {
             return None;
         }

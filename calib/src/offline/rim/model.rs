@@ -111,12 +111,12 @@ pub struct Options {
     pub gate_sigmas: f64,
     /// Allowance for the rig's calibration error in the two-view test, pixels (0: trust the rig fully). A real rig needs 0.3 to 1.
     pub calibration_px: f64,
-    /// Systematic error that edge points share along a contour, pixels (0: none, as for points without a picture). Detected edges
+    /// Systematic error that edge points share along a contour, pixels (0: none, as for points without an image). Detected edges
     /// have 0.05 to 0.1; an ellipse that it could have made of a circle is taken for a circle.
     pub edge_bias_px: f64,
     /// Largest residual standard deviation that edge points may show, pixels.
     pub max_noise_px: f64,
-    /// Smallest acceptable semi-minor axis of a rim's picture, pixels (errata C1).
+    /// Smallest acceptable semi-minor axis of a rim's image, pixels (errata C1).
     pub min_minor_axis_px: f64,
     /// Largest acceptable standard deviation of the centre (length units); `None`: a tenth of the rim's radius.
     pub max_sigma_centre: Option<f64>,
@@ -150,7 +150,7 @@ impl Options {
     }
 }
 
-/// An ellipse in a picture or in a plane: centre, semi-axes `a >= b > 0`, direction of `a` in `[0, pi)` from x towards y.
+/// An ellipse in an image or in a plane: centre, semi-axes `a >= b > 0`, direction of `a` in `[0, pi)` from x towards y.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ellipse2 {
     /// Centre.
@@ -209,7 +209,7 @@ pub struct Report {
     pub sigma_normal_in_images: f64,
     /// Size of the part of the edge error that varies smoothly round the contours, pixels.
     pub smooth_px: f64,
-    /// Semi-minor axes of the rim's pictures, left and right, pixels.
+    /// Semi-minor axes of the rim's images, left and right, pixels.
     pub minor_axis_px: [f64; 2],
     /// Angle between the two viewing rays of the centre, radians.
     pub vergence: f64,
@@ -219,7 +219,7 @@ pub struct Report {
     pub separation: f64,
     /// Scale-free form of the paper's condition (equation 4): `1 - 4 I1 I3 / I2^2`.
     pub delta: f64,
-    /// Epipolar tangency gaps in the right picture, pixels; NaN when the epipole lies inside the ellipse.
+    /// Epipolar tangency gaps in the right image, pixels; NaN when the epipole lies inside the ellipse.
     pub gap_px: [f64; 2],
     /// Predicted standard deviation of the gaps from the two fits, pixels.
     pub gap_sigma_px: [f64; 2],
@@ -235,7 +235,7 @@ pub struct Report {
     pub noise: f64,
     /// Every model that was tried.
     pub scores: Vec<Score>,
-    /// Fitted ellipses in the pictures (of the outer outlines), left and right.
+    /// Fitted ellipses in the images (of the outer outlines), left and right.
     pub image_ellipse: [Ellipse2; 2],
     /// Residual of every input point against the chosen model, pixels, positive outside; in the order given.
     pub residuals: [Vec<f64>; 2],

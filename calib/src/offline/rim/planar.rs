@@ -27,7 +27,7 @@ const NEARLY_ROUND: f64 = 0.97;
 pub struct Analysis {
     /// Projection centres, left and right.
     pub centres: [Vector3<f64>; 2],
-    /// Ellipse fits in the pictures with the points they stand on.
+    /// Ellipse fits in the images with the points they stand on.
     pub fits: [RobustFit; 2],
     /// The viewing cones.
     pub cones: ConePair,
@@ -53,7 +53,7 @@ pub struct Analysis {
     pub excess: f64,
     /// Its limit at the gate.
     pub excess_limit: f64,
-    /// Whether the contours are two pictures of one plane rim seen from its face; otherwise why not.
+    /// Whether the contours are two images of one plane rim seen from its face; otherwise why not.
     pub verdict: Result<(), Refusal>,
 }
 

@@ -73,7 +73,7 @@ pub enum Refusal {
         limit_px: f64,
     },
     /// The rim is seen edge-on.
-    #[error("{} view: the rim is seen edge-on, its picture has a semi-minor axis of {minor_px:.1} px (limit {limit_px:.1}): move the rig to see more of its face", name(.view))]
+    #[error("{} view: the rim is seen edge-on, its image has a semi-minor axis of {minor_px:.1} px (limit {limit_px:.1}): move the rig to see more of its face", name(.view))]
     EdgeOn {
         /// The view.
         view: View,
@@ -91,8 +91,8 @@ pub enum Refusal {
     /// Both cameras stand at one place.
     #[error("the cameras have no baseline: both projection centres coincide; check the rig file")]
     NoBaseline,
-    /// The two contours are not pictures of one rim.
-    #[error("the two contours are not pictures of one rim: epipolar tangents differ by {:.2} and {:.2} px, {:.1} and {:.1} standard deviations; two-view excess {excess:.1} (limit {limit:.1}), delta {delta:.1e}: click the same contour in both pictures",
+    /// The two contours are not images of one rim.
+    #[error("the two contours are not images of one rim: epipolar tangents differ by {:.2} and {:.2} px, {:.1} and {:.1} standard deviations; two-view excess {excess:.1} (limit {limit:.1}), delta {delta:.1e}: click the same contour in both images",
         gap_px[0], gap_px[1], gap_px[0].abs() / gap_sigma_px[0], gap_px[1].abs() / gap_sigma_px[1])]
     Mismatch {
         /// Epipolar tangency gaps, pixels.
@@ -149,7 +149,7 @@ pub enum Refusal {
     },
     /// The pencil of the cones has no real pair of planes.
     #[error(
-        "the two viewing cones have no real pair of planes in common ({why}): click the same contour in both pictures, or move the rig off the rim's axis"
+        "the two viewing cones have no real pair of planes in common ({why}): click the same contour in both images, or move the rig off the rim's axis"
     )]
     NoPlanes {
         /// Which step failed.

@@ -1,13 +1,13 @@
 //! `graspd demo`: the whole chain against a simulated world, each part a process of its own.
 //!
-//! The demo is an operator with two hands: it takes the first pictures out of shared memory, clicks where the world's script says,
+//! The demo is an operator with two hands: it takes the first images out of shared memory, clicks where the world's script says,
 //! runs `graspd plan`, sends the plan, arms, servoes and watches. It never tells the daemon where anything stands, and the final
 //! error is the scene's word, who knows, not the daemon's.
 
 mod cell;
-mod picture;
 mod process;
 mod result;
+mod trajectories;
 mod watch;
 
 use super::args::DemoArgs;
@@ -52,8 +52,8 @@ pub fn run(args: &DemoArgs) -> Result<Exit, Failure> {
     let node = create_node(&config.names, "graspd-demo").map_err(|e| Failure::link(e.to_string()))?;
     let client = RequestClient::new(&node).map_err(|e| Failure::link(e.to_string()))?;
 
-    say.step("taking the first pictures");
-    first_pictures(&config, &config.names, &folder)?;
+    say.step("taking the first images");
+    first_images(&config, &config.names, &folder)?;
     say.step("off line: from two clicks to a set-point");
     let plan = plan(args, &cell, &folder)?;
     say.plan(&plan);
@@ -84,7 +84,7 @@ pub fn run(args: &DemoArgs) -> Result<Exit, Failure> {
     let _ = client.ask(Verb::Stop, b"", now_ns(), Duration::from_secs(2));
     let result = result::close(result, &mut cell, &folder);
     if !args.headless {
-        picture::trajectories(&folder, &outcome.trajectories)?;
+        trajectories::draw(&folder, &outcome.trajectories)?;
     }
     say.result(args, &result, &folder);
     if outcome.last.state == watch::FAULT {
@@ -107,7 +107,7 @@ fn settle(node: &ShmNode, cell: &mut Cell, mut outcome: watch::Outcome) -> Resul
 }
 
 fn ask(client: &RequestClient, verb: Verb, payload: &[u8]) -> Result<(), Failure> {
-    // Readiness may need a moment after the marks are found: robot state and pictures have to have been good for a while.
+    // Readiness may need a moment after the marks are found: robot state and images have to have been good for a while.
     let until = Instant::now() + Duration::from_secs(5);
     loop {
         let answer =
@@ -127,8 +127,8 @@ fn status(client: &RequestClient) -> String {
 }
 
 /// Saves one stereo pair as `left.png` and `right.png`, as an operator's console would freeze it.
-fn first_pictures(config: &crate::config::Config, names: &Names, folder: &Path) -> Result<(), Failure> {
-    let node = create_node(names, "graspd-demo-pictures").map_err(|e| Failure::link(e.to_string()))?;
+fn first_images(config: &crate::config::Config, names: &Names, folder: &Path) -> Result<(), Failure> {
+    let node = create_node(names, "graspd-demo-images").map_err(|e| Failure::link(e.to_string()))?;
     let mut frames = FrameSubscriber::new(&node, FramePolicy::default()).map_err(|e| Failure::link(e.to_string()))?;
     let until = Instant::now() + Duration::from_secs(10);
     while Instant::now() < until {
@@ -249,7 +249,7 @@ impl Say {
         }
         print!("{}", r.table());
         if !args.headless {
-            println!("pictures: {0}/plan.png, {0}/trajectories.png; report: {0}/plan.html", folder.display());
+            println!("images: {0}/plan.png, {0}/trajectories.png; report: {0}/plan.html", folder.display());
         }
     }
 }

@@ -22,8 +22,8 @@ pub(super) struct DemoResult {
     pub orientation_error_deg: f64,
     /// From the start of servoing to convergence.
     pub convergence_s: Option<f64>,
-    /// Beats of the command thread, and those that came a whole period late.
-    pub beats: (u64, u64),
+    /// Cycles of the command thread, and those that came a whole period late.
+    pub cycles: (u64, u64),
     /// Pairs tracked.
     pub frames: u64,
     /// Pairs a second that the scene published while the arm was servoed.
@@ -56,7 +56,7 @@ pub(super) fn collect(args: &DemoArgs, cell: &mut Cell, outcome: &Outcome) -> Re
         position_error_mm,
         orientation_error_deg,
         convergence_s: outcome.seconds.filter(|_| s.state == CONVERGED),
-        beats: (s.ticks, s.overruns),
+        cycles: (s.ticks, s.overruns),
         frames: s.frames,
         pairs_per_s: cell.pairs_per_second(),
         limit_violations: None,
@@ -101,8 +101,8 @@ impl DemoResult {
             "position_error_mm": self.position_error_mm,
             "orientation_error_deg": self.orientation_error_deg,
             "convergence_s": self.convergence_s,
-            "ticks": self.beats.0,
-            "overruns": self.beats.1,
+            "ticks": self.cycles.0,
+            "overruns": self.cycles.1,
             "frames": self.frames,
             "pairs_per_s": self.pairs_per_s,
             "limit_violations": self.limit_violations,
@@ -137,9 +137,9 @@ impl DemoResult {
         );
         let _ = writeln!(
             out,
-            "on the wire  {violations} limit violations; {} beats, {} overruns, {} stereo pairs ({:.1} a second)",
-            self.beats.0,
-            self.beats.1,
+            "on the wire  {violations} limit violations; {} cycles, {} overruns, {} stereo pairs ({:.1} a second)",
+            self.cycles.0,
+            self.cycles.1,
             self.frames,
             self.pairs_per_s.unwrap_or(f64::NAN)
         );

@@ -1,4 +1,4 @@
-//! What the demo sees of the daemon: telemetry, for progress, for the table and for the picture of the marks' ways.
+//! What the demo sees of the daemon: telemetry, for progress, for the table and for the image of the marks' ways.
 
 use super::cell::Cell;
 use crate::exit::Failure;
@@ -16,7 +16,7 @@ pub(super) const CONVERGED: u32 = 4;
 /// State number of a fault.
 pub(super) const FAULT: u32 = 6;
 
-/// The ways of the marks in both pictures, a sample every 20 ms.
+/// The ways of the marks in both images, a sample every 20 ms.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Trajectories {
     /// By view, mark and time, px; NaN where not seen.

@@ -1,9 +1,9 @@
-//! Round blobs of a whole picture, in one pass a threshold and without a heap.
+//! Round blobs of a whole image, in one pass a threshold and without a heap.
 //!
-//! The picture is cut into tiles; a pixel is judged against levels of its tile and the eight round it, so that a shaded or badly lit
-//! picture still gives its discs. Two levels for either polarity: half way between darkest and lightest finds discs on an even
+//! The image is cut into tiles; a pixel is judged against levels of its tile and the eight round it, so that a shaded or badly lit
+//! image still gives its discs. Two levels for either polarity: half way between darkest and lightest finds discs on an even
 //! ground, between the mean and the extreme finds a disc beside something much lighter or darker. Runs are linked row by row;
-//! a blob is judged and forgotten as soon as it ends, so that memory depends on the picture's width, not on its content.
+//! a blob is judged and forgotten as soon as it ends, so that memory depends on the image's width, not on its content.
 
 use crate::geom::Pixel;
 use crate::image::ImageView;
@@ -105,7 +105,7 @@ impl BlobScratch {
         }
     }
 
-    /// Finds the round blobs of a picture, dark and light; the roundest when there are more than fit.
+    /// Finds the round blobs of an image, dark and light; the roundest when there are more than fit.
     pub(crate) fn detect(
         &mut self,
         image: &ImageView<'_>,

@@ -6,7 +6,7 @@ use crate::gripper::{Gripper, MAX_MARKS, Mark};
 use crate::math;
 use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion};
 
-/// Hypotheses kept for verification in the pictures.
+/// Hypotheses kept for verification in the images.
 pub(crate) const MAX_HYPOTHESES: usize = 12;
 
 /// How well distances must agree, and how much may be tried.

@@ -1,8 +1,8 @@
 //! Finding the marks from scratch: no earlier pose, no human.
 //!
-//! Round blobs of both pictures ([`blobs`]) are paired along epipolar lines into points of space ([`pairs`]); triples
+//! Round blobs of both images ([`blobs`]) are paired along epipolar lines into points of space ([`pairs`]); triples
 //! of points whose distances are those of three marks propose poses, on which all other marks vote
-//! ([`constellation`]); the best few are then measured in the pictures to sub-pixel and must hold there. A runner-up
+//! ([`constellation`]); the best few are then measured in the images to sub-pixel and must hold there. A runner-up
 //! that holds as well makes the answer ambiguous, and an ambiguous answer is refused: a gripper taken the wrong way
 //! round would be driven into something.
 //!
@@ -131,7 +131,7 @@ pub struct Acquisition {
 /// Why the gripper was not found; each says what an operator could look at.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum AcquireFailure {
-    /// A picture has not the size of the rig's camera.
+    /// An image has not the size of the rig's camera.
     Size(View),
     /// Fewer than four round blobs in a view: marks hidden, out of focus, dark, or smaller than 5 px.
     TooFewBlobs {
@@ -147,7 +147,7 @@ pub enum AcquireFailure {
     /// Pairs in space, but no four with the distances of the gripper file: another gripper, wrong mark positions or
     /// scale.
     NoConstellation,
-    /// A pose was proposed, but too few marks hold in the pictures.
+    /// A pose was proposed, but too few marks hold in the images.
     NotVerified {
         /// Marks that hold in each view under the best pose.
         seen: [u8; 2],
@@ -162,7 +162,7 @@ pub enum AcquireFailure {
         /// Residual with the rig as its file has it, pixels.
         residual_px: f64,
     },
-    /// Two different poses explain the pictures equally well: the mark layout is symmetric, or the mark that tells is
+    /// Two different poses explain the images equally well: the mark layout is symmetric, or the mark that tells is
     /// hidden.
     Ambiguous {
         /// Marks that hold under either pose.

@@ -1,4 +1,4 @@
-//! Which blob of the left picture may be which of the right, and where in space that would be.
+//! Which blob of the left image may be which of the right, and where in space that would be.
 
 use super::blobs::{Blob, MAX_BLOBS};
 use crate::geom::{Normalized, Rig, RigError, Vec3, View};
@@ -14,7 +14,7 @@ pub const MAX_POINTS: usize = 512;
 pub(crate) struct StereoPoint {
     /// In the left frame, metres.
     pub(crate) position: Vec3,
-    /// Radius of a disc of that picture at that distance, metres.
+    /// Radius of a disc of that image at that distance, metres.
     pub(crate) radius: f64,
     pub(crate) dark: bool,
     /// Index of the blob in each view.

@@ -6,7 +6,7 @@ use crate::gripper::{Gripper, MAX_MARKS, Mark};
 use crate::math;
 use nalgebra::Point3;
 
-/// Two arrangements closer than this, metres, may be taken for each other in a poor picture.
+/// Two arrangements closer than this, metres, may be taken for each other in a poor image.
 const TOLERANCE: f64 = 0.003;
 type Set = heapless::Vec<usize, MAX_MARKS>;
 

@@ -2,7 +2,7 @@
 //!
 //! For a shift of the predicted outline, each direction compares the grey just inside with the grey just outside. A disc of
 //! another size scores little (one of its two rings is wrong everywhere), a half hidden one still peaks at the right place, and
-//! the work is a fixed number of samples whatever the picture holds (fault M07).
+//! the work is a fixed number of samples whatever the image holds (fault M07).
 
 use super::Outline;
 use crate::image::ImageView;
@@ -55,7 +55,7 @@ impl Vote<'_, '_> {
 
 /// Searches shifts up to `range` pixels along each axis. `sign` is +1 for a dark mark, -1 for a light one.
 ///
-/// The prediction itself is taken without a search when it already explains the picture.
+/// The prediction itself is taken without a search when it already explains the image.
 pub(crate) fn search(
     image: &ImageView<'_>,
     outline: &Outline,

@@ -1,7 +1,7 @@
-//! Marks in one picture: predicted outline, coarse vote in a window, sub-pixel edges, fitted shift.
+//! Marks in one image: predicted outline, coarse vote in a window, sub-pixel edges, fitted shift.
 //!
 //! The work on a mark is bounded by constants (samples in the vote, points on the outline, samples along a normal, rounds of the
-//! fit), so that no picture, however full of blobs, makes a cycle late (fault M07).
+//! fit), so that no image, however full of blobs, makes a cycle late (fault M07).
 
 mod coarse;
 mod edge;
@@ -30,7 +30,7 @@ pub struct MarkSettings {
     pub min_facing: f64,
     /// Largest relative stretch against the predicted shape. Default 0.25.
     pub max_stretch: f64,
-    /// Smallest distance from the centre to the rim's tangent, pixels: flatter pictures are refused. Default 1.6.
+    /// Smallest distance from the centre to the rim's tangent, pixels: flatter images are refused. Default 1.6.
     pub min_minor_px: f64,
 }
 
@@ -52,7 +52,7 @@ impl Default for MarkSettings {
 pub enum MarkMiss {
     /// The predicted disc is too flat, too small, or larger than the window cap allows.
     Size,
-    /// The prediction lies outside the picture, or within two pixels of its border.
+    /// The prediction lies outside the image, or within two pixels of its border.
     Outside,
     /// The window holds too little contrast: black, saturated, fogged.
     Contrast,
@@ -67,10 +67,10 @@ const MAX_MAJOR: f64 = 48.0;
 /// Added to every covariance, px²: what pixel structure and lens model leave behind.
 const CENTRE_FLOOR: f64 = 0.008 * 0.008;
 
-/// Measures one mark in one picture, from its predicted outline.
+/// Measures one mark in one image, from its predicted outline.
 ///
-/// The result's pixel is the picture of the disc's *centre* (distorted pixels): the fitted shift is applied to the predicted
-/// picture of the centre. `search_px` overrides the settings' range, so that a second look may be narrow.
+/// The result's pixel is the image of the disc's *centre* (distorted pixels): the fitted shift is applied to the predicted
+/// image of the centre. `search_px` overrides the settings' range, so that a second look may be narrow.
 ///
 /// # Errors
 /// Says why there is no measurement; that is an ordinary event, never a fault by itself.

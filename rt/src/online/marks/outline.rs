@@ -1,8 +1,8 @@
-//! The predicted picture of one mark: where its outline runs, given the pose.
+//! The predicted image of one mark: where its outline runs, given the pose.
 //!
-//! The outline is the exact perspective picture of the disc's rim through the lens model, not an ellipse: under distortion it
-//! is none, and the picture of the disc's centre is neither its centroid nor its ellipse's centre (literature: discocal 2024).
-//! Measuring how this curve has to be *shifted* to fit the picture therefore gives the centre's picture without that bias.
+//! The outline is the exact perspective image of the disc's rim through the lens model, not an ellipse: under distortion it
+//! is none, and the image of the disc's centre is neither its centroid nor its ellipse's centre (literature: discocal 2024).
+//! Measuring how this curve has to be *shifted* to fit the image therefore gives the centre's image without that bias.
 
 use crate::geom::{Camera, Pixel, Pose, Vec3};
 use crate::gripper::Mark;
@@ -24,10 +24,10 @@ pub struct OutlinePoint {
     pub support: f64,
 }
 
-/// Predicted picture of a mark.
+/// Predicted image of a mark.
 #[derive(Clone, Debug)]
 pub struct Outline {
-    /// Picture of the disc's centre.
+    /// Image of the disc's centre.
     pub centre: Pixel,
     /// Largest distance of the outline from the centre, pixels.
     pub major: f64,
@@ -53,7 +53,7 @@ fn tangents(n: &Vec3) -> (Vec3, Vec3) {
 /// Predicts a mark's outline in a camera.
 ///
 /// `None` when the disc faces away (`facing` below `min_facing`), is behind the camera or too near to it, or when a figure is
-/// not finite. The outline may lie outside the picture: the caller decides.
+/// not finite. The outline may lie outside the image: the caller decides.
 pub fn predict(camera: &Camera, camera_from_gripper: &Pose, mark: &Mark, min_facing: f64) -> Option<Outline> {
     let centre3 = (camera_from_gripper * Point3::from(mark.position)).coords;
     let normal = camera_from_gripper.rotation * mark.normal;

@@ -2,7 +2,7 @@
 
 use crate::reference::{POINTS, Shape, around};
 use graspd_calib::files::GripperFile;
-use graspd_calib::offline::edges::picture::Picture;
+use graspd_calib::offline::edges::grey_image::GreyImage;
 use graspd_hil::scenario::{Options, Scenario};
 use graspd_hil::scene::{Part, Snapshot};
 use graspd_rt::geom::{Pixel, Pose, Rig, Vec3, View};
@@ -109,7 +109,7 @@ pub struct Cell {
     /// What it was drawn from.
     pub seed: u64,
     /// Left and right image.
-    pub images: [Picture; 2],
+    pub images: [GreyImage; 2],
     /// The cameras as they are.
     pub true_rig: Rig,
     /// The gripper, its jaws wide enough for any wheel: what is judged is the rim.
@@ -186,16 +186,16 @@ impl Cell {
             bar = Some(rim(core));
             let shot = Snapshot { object_from_gripper: [None; 2], opening: 0.1, frame: 0, hidden_marks: 0 };
             let mut renderer = s.renderer();
-            grey = View::BOTH.map(|v| with_noise(renderer.picture(v, &shot).into_raw(), noise, &mut rng));
+            grey = View::BOTH.map(|v| with_noise(renderer.image(v, &shot).into_raw(), noise, &mut rng));
         }
         let size = s.true_rig.left;
         let (w, h) = (size.width as usize, size.height as usize);
         let mut images = Vec::new();
         for g in grey {
             let g = if noise == Noise::Jpeg { through_jpeg(&g, w as u32, h as u32)? } else { g };
-            images.push(Picture::new(w, h, g).ok_or("the image has not the camera's size")?);
+            images.push(GreyImage::new(w, h, g).ok_or("the image has not the camera's size")?);
         }
-        let images: [Picture; 2] = images.try_into().map_err(|_| "two views, two images")?;
+        let images: [GreyImage; 2] = images.try_into().map_err(|_| "two views, two images")?;
         Ok(Self { kind, seed, images, true_rig: s.true_rig, gripper, paint, bar, clicks, options })
     }
 

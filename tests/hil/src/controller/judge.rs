@@ -1,7 +1,7 @@
 //! The oracle: judges what clients ask for and what the arm does, and remembers the worst of both.
 //!
 //! It knows the register layout of the project's control script (set-points in float registers 24 to 29, mode word in integer
-//! register 24, beat counter in 25) and nothing of the client's code. It is fed with every input package and every control step,
+//! register 24, heartbeat counter in 25) and nothing of the client's code. It is fed with every input package and every control step,
 //! live by the mock or later from its record.
 
 use crate::plant::Joints;
@@ -19,7 +19,7 @@ pub struct Limits {
     pub arm_rate: Joints,
     /// Joint positions either way, rad.
     pub position: Joints,
-    /// Control step, s: beats of a client are this far apart at least.
+    /// Control step, s: cycles of a client are this far apart at least.
     pub step_s: f64,
 }
 
@@ -28,7 +28,7 @@ const MODE_VELOCITY: i32 = 1;
 /// First float register of the rates.
 const RATES: u16 = 24;
 const MODE: u16 = 24;
-const BEAT: u16 = 25;
+const CYCLE: u16 = 25;
 /// A joint slower than this stands still, rad/s.
 const REST: f64 = 1e-3;
 /// Violations kept in words; all are counted.
@@ -70,8 +70,8 @@ pub enum Rule {
 pub struct Episode {
     /// Left rest, ns.
     pub moved_ns: u64,
-    /// The last beat that a client sent before the arm rested, ns.
-    pub last_beat_ns: u64,
+    /// The last cycle that a client sent before the arm rested, ns.
+    pub last_heartbeat_ns: u64,
     /// Fastest joint speed of the episode, rad/s.
     pub peak_rate: f64,
     /// At rest again, ns; 0 while moving.
@@ -79,10 +79,10 @@ pub struct Episode {
 }
 
 impl Episode {
-    /// From the last beat to rest, ns; `None` while the arm moves. After a client died this is the robot's own reaction:
+    /// From the last cycle to rest, ns; `None` while the arm moves. After a client died this is the robot's own reaction:
     /// watchdog and ramp.
     pub fn stop_ns(&self) -> Option<u64> {
-        (self.rest_ns > 0).then(|| self.rest_ns.saturating_sub(self.last_beat_ns))
+        (self.rest_ns > 0).then(|| self.rest_ns.saturating_sub(self.last_heartbeat_ns))
     }
 }
 
@@ -109,8 +109,8 @@ pub struct Summary {
     pub max_target_accel: f64,
     /// Longest pause between two set-points while rates were not zero, ns.
     pub max_setpoint_gap_ns: u64,
-    /// Time of the newest beat, ns.
-    pub last_beat_ns: u64,
+    /// Time of the newest cycle, ns.
+    pub last_heartbeat_ns: u64,
     /// Movements; the newest 64.
     pub episodes: Vec<Episode>,
     /// Movements in all.
@@ -121,7 +121,7 @@ pub struct Summary {
 struct Setpoint {
     at_ns: u64,
     rates: Joints,
-    beat: i32,
+    cycle: i32,
 }
 
 /// The judge itself.
@@ -131,7 +131,7 @@ pub struct Judge {
     summary: Summary,
     rates: Joints,
     mode: i32,
-    beat: i32,
+    cycle: i32,
     last: Option<Setpoint>,
     moving: Option<Episode>,
 }
@@ -154,7 +154,7 @@ pub struct StepSample {
 impl Judge {
     /// A judge with these limits.
     pub fn new(limits: Limits) -> Self {
-        Judge { limits, summary: Summary::default(), rates: [0.0; 6], mode: 0, beat: 0, last: None, moving: None }
+        Judge { limits, summary: Summary::default(), rates: [0.0; 6], mode: 0, cycle: 0, last: None, moving: None }
     }
 
     /// The limits in force.
@@ -180,11 +180,11 @@ impl Judge {
                     is_setpoint = true;
                 }
                 (("input_int_register_", Some(MODE)), Value::Int32(v)) => self.mode = *v,
-                (("input_int_register_", Some(BEAT)), Value::Int32(v)) => {
-                    if *v != self.beat {
-                        self.summary.last_beat_ns = at_ns;
+                (("input_int_register_", Some(CYCLE)), Value::Int32(v)) => {
+                    if *v != self.cycle {
+                        self.summary.last_heartbeat_ns = at_ns;
                     }
-                    self.beat = *v;
+                    self.cycle = *v;
                 }
                 _ => {}
             }
@@ -199,7 +199,7 @@ impl Judge {
         // Outside velocity mode the script ignores the rates and ramps by itself: they count as zero.
         let moving = self.mode == MODE_VELOCITY;
         let rates = if moving { self.rates } else { [0.0; 6] };
-        let now = Setpoint { at_ns, rates, beat: self.beat };
+        let now = Setpoint { at_ns, rates, cycle: self.cycle };
         let limits = self.limits;
         for (joint, v) in self.rates.into_iter().enumerate() {
             if !v.is_finite() {
@@ -214,11 +214,11 @@ impl Judge {
                 self.violate(at_ns, Rule::ZeroUnlessVelocity, Some(joint), v);
             }
             // A client that has just connected finds an arm at rest: its first set-point counts from there.
-            let (from, last_beat) = self.last.map_or((0.0, now.beat), |l| (l.rates[joint], l.beat));
+            let (from, last_heartbeat) = self.last.map_or((0.0, now.cycle), |l| (l.rates[joint], l.cycle));
             if moving && from.is_finite() {
-                // Beats that were skipped leave room for more change; a beat that stands still is one step at least.
-                let beats = f64::from(now.beat.wrapping_sub(last_beat).clamp(1, 1000));
-                let accel = (v - from).abs() / (beats * limits.step_s);
+                // Cycles that were skipped leave room for more change; a heartbeat that stops is one step at least.
+                let cycles = f64::from(now.cycle.wrapping_sub(last_heartbeat).clamp(1, 1000));
+                let accel = (v - from).abs() / (cycles * limits.step_s);
                 self.summary.max_setpoint_accel = self.summary.max_setpoint_accel.max(accel);
                 if accel > limits.accel * 1.01 + 1e-6 {
                     self.violate(at_ns, Rule::Accel, Some(joint), accel);
@@ -260,7 +260,7 @@ impl Judge {
             }
             (Some(episode), false) => episode.peak_rate = episode.peak_rate.max(fastest),
             (Some(episode), true) => {
-                (episode.rest_ns, episode.last_beat_ns) = (s.at_ns, self.summary.last_beat_ns);
+                (episode.rest_ns, episode.last_heartbeat_ns) = (s.at_ns, self.summary.last_heartbeat_ns);
                 if self.summary.episodes.len() == 64 {
                     self.summary.episodes.remove(0);
                 }
@@ -284,7 +284,7 @@ impl Judge {
     pub fn summary(&self) -> Summary {
         let mut summary = self.summary.clone();
         if let Some(mut episode) = self.moving {
-            episode.last_beat_ns = self.summary.last_beat_ns;
+            episode.last_heartbeat_ns = self.summary.last_heartbeat_ns;
             summary.episodes.push(episode);
         }
         summary
@@ -299,12 +299,12 @@ mod tests {
         Judge::new(Limits { rate: 0.5, accel: 4.0, arm_rate: [3.0; 6], position: [6.2; 6], step_s: 0.002 })
     }
 
-    fn package(mode: i32, beat: i32, rate: f64) -> Vec<(Field, Value)> {
+    fn package(mode: i32, cycle: i32, rate: f64) -> Vec<(Field, Value)> {
         let mut values: Vec<_> = (24..30)
             .map(|n| (Field::input(&format!("input_double_register_{n}")).unwrap(), Value::Double(rate)))
             .collect();
         values.insert(0, (Field::input("input_int_register_24").unwrap(), Value::Int32(mode)));
-        values.insert(1, (Field::input("input_int_register_25").unwrap(), Value::Int32(beat)));
+        values.insert(1, (Field::input("input_int_register_25").unwrap(), Value::Int32(cycle)));
         values
     }
 
@@ -346,7 +346,7 @@ mod tests {
     }
 
     #[test]
-    fn a_movement_is_measured_from_the_last_beat_to_rest() {
+    fn a_movement_is_measured_from_the_last_cycle_to_rest() {
         let mut j = judge();
         let sample = |at_ns, v| StepSample { at_ns, q: [0.0; 6], qd: [v; 6], target_qd: [v; 6], target_qdd: [0.0; 6] };
         j.step(&sample(10, 0.0));
@@ -355,6 +355,6 @@ mod tests {
         assert_eq!(j.summary().episodes[0].rest_ns, 0);
         j.step(&sample(30, 0.0));
         let e = j.summary().episodes[0];
-        assert_eq!((e.moved_ns, e.last_beat_ns, e.rest_ns, j.summary().episode_count), (20, 15, 30, 1));
+        assert_eq!((e.moved_ns, e.last_heartbeat_ns, e.rest_ns, j.summary().episode_count), (20, 15, 30, 1));
     }
 }

@@ -143,7 +143,7 @@ fn draw_rig(o: &Options, rng: &mut ChaCha8Rng, target: &Vec3, towards: &Vec3) ->
     let middle = target + towards * o.distance_m * rng.random_range(0.95..1.05);
     let up = if towards.z.abs() > 0.95 { Vec3::x() } else { Vec3::z() };
     let roll = Rotation3::from_axis_angle(&nalgebra::Unit::new_normalize(*towards), rng.random_range(-0.12..0.12));
-    // Right of the picture as seen by a camera that looks along -towards, y down.
+    // Right of the image as seen by a camera that looks along -towards, y down.
     let across = roll * (-towards).cross(&up).try_normalize(1e-3)?;
     let pose = |rng: &mut ChaCha8Rng, side: f64| {
         let centre = middle + across * (0.5 * side * o.baseline_m) + jitter(rng, 0.01);

@@ -30,7 +30,7 @@ pub const STANDOFF_M: f64 = 0.12;
 /// A cell: the truth, and what graspd is given.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scenario {
-    /// Seed of all that was drawn, and of the pictures' noise.
+    /// Seed of all that was drawn, and of the images' noise.
     pub seed: u64,
     /// The arm's model.
     pub model: Model,

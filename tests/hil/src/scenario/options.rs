@@ -31,13 +31,13 @@ pub struct Options {
     pub baseline_m: f64,
     /// Focal length, pixels.
     pub focal_px: f64,
-    /// Picture size, pixels.
+    /// Image size, pixels.
     pub size: [u32; 2],
     /// Factor on the sensor's noise.
     pub noise: f64,
     /// Bolts and holes on the wall that look like marks.
     pub clutter: u32,
-    /// Whether a start pose and the path from it are demanded; off for pictures of a valve alone, whatever its size.
+    /// Whether a start pose and the path from it are demanded; off for images of a valve alone, whatever its size.
     pub with_arm: bool,
 }
 

@@ -19,7 +19,7 @@ pub struct Seen {
     pub least: usize,
 }
 
-/// Counts the marks that both cameras see well inside their pictures (margin in pixels).
+/// Counts the marks that both cameras see well inside their images (margin in pixels).
 pub fn seen_marks(body: &Body, rig: &Rig, left_from_gripper: &Pose, opening: f64, margin: f64) -> Seen {
     let mut seen = [0u64; 2];
     for view in View::BOTH {

@@ -27,7 +27,7 @@ pub(super) struct Layers {
     pub(super) rays: Vec<Vec3>,
     /// Light that arrives, by the lens.
     pub(super) falloff: Vec<f32>,
-    /// The blurred picture without gripper in 64ths of a grey value, and each pixel's noise amplitude.
+    /// The blurred image without gripper in 64ths of a grey value, and each pixel's noise amplitude.
     pub(super) exposed: (Vec<i16>, Vec<i16>),
 }
 
@@ -177,25 +177,25 @@ impl Layers {
     fn expose(&mut self, sensor: &Sensor) {
         let (w, h) = (self.width, self.height);
         let all = Rect { x0: 0, y0: 0, x1: w, y1: h };
-        let mut picture: Vec<f32> = (0..w * h).map(|i| self.still(i % w, i / w)).collect();
+        let mut image: Vec<f32> = (0..w * h).map(|i| self.still(i % w, i / w)).collect();
         let mut scratch = Vec::new();
-        blur(&mut picture, all.width(), &sensor.kernel(), &mut scratch);
-        self.exposed.0 = picture.iter().map(|g| (g * SCALE).clamp(0.0, 20_000.0) as i16).collect();
-        self.exposed.1 = picture.iter().map(|g| sensor.amplitude(*g)).collect();
+        blur(&mut image, all.width(), &sensor.kernel(), &mut scratch);
+        self.exposed.0 = image.iter().map(|g| (g * SCALE).clamp(0.0, 20_000.0) as i16).collect();
+        self.exposed.1 = image.iter().map(|g| sensor.amplitude(*g)).collect();
     }
 }
 
-/// Blurs a picture of rows of `width` in place with a symmetric kernel (centre first); borders repeat.
-pub(super) fn blur(picture: &mut [f32], width: usize, kernel: &[f32], scratch: &mut Vec<f32>) {
+/// Blurs an image of rows of `width` in place with a symmetric kernel (centre first); borders repeat.
+pub(super) fn blur(image: &mut [f32], width: usize, kernel: &[f32], scratch: &mut Vec<f32>) {
     let n = kernel.len() - 1;
     if n == 0 || width == 0 {
         return;
     }
-    let height = picture.len() / width;
+    let height = image.len() / width;
     // Rows, through a padded copy of each.
     scratch.clear();
     scratch.resize(width + 2 * n, 0.0);
-    for row in picture.chunks_exact_mut(width) {
+    for row in image.chunks_exact_mut(width) {
         scratch[..n].fill(row[0]);
         scratch[n..n + width].copy_from_slice(row);
         scratch[n + width..].fill(row[width - 1]);
@@ -211,9 +211,9 @@ pub(super) fn blur(picture: &mut [f32], width: usize, kernel: &[f32], scratch: &
     }
     // Columns, row by row: a ring would save memory, a copy is simpler and as fast.
     scratch.clear();
-    scratch.extend_from_slice(picture);
+    scratch.extend_from_slice(image);
     for y in 0..height {
-        let out = &mut picture[y * width..(y + 1) * width];
+        let out = &mut image[y * width..(y + 1) * width];
         let src = |y: isize| {
             let y = y.clamp(0, height as isize - 1) as usize;
             &scratch[y * width..(y + 1) * width]

@@ -3,7 +3,7 @@
 //! The fixed part is traced once per view with fine sampling; the gripper is drawn into it for every frame with exact area
 //! coverage, under the lens's distortion, hidden and hiding by depth, then blurred and exposed with noise.
 //!
-//! [`StereoRenderer`] makes pictures; [`crate::scenario`] says of what.
+//! [`StereoRenderer`] makes images; [`crate::scenario`] says of what.
 
 mod body;
 mod layers;
@@ -42,7 +42,7 @@ pub struct Snapshot {
     pub object_from_gripper: [Option<Pose>; 2],
     /// Distance between the jaws, metres.
     pub opening: f64,
-    /// Number of the picture: chooses the noise.
+    /// Number of the image: chooses the noise.
     pub frame: u64,
     /// Marks that a fault hides, by bit.
     pub hidden_marks: u32,
@@ -75,7 +75,7 @@ impl StereoRenderer {
         &self.body
     }
 
-    /// Width and height of the pictures.
+    /// Width and height of the images.
     pub fn size(&self) -> (usize, usize) {
         let c = self.views[0].camera();
         (c.width as usize, c.height as usize)
@@ -93,8 +93,8 @@ impl StereoRenderer {
         self.views[view.index()].draw(&self.stage, moving, &self.noise, frame, dst, stride);
     }
 
-    /// Draws one view into a picture of its own.
-    pub fn picture(&mut self, view: View, shot: &Snapshot) -> image::GrayImage {
+    /// Draws one view into an image of its own.
+    pub fn image(&mut self, view: View, shot: &Snapshot) -> image::GrayImage {
         let (w, h) = self.size();
         let mut data = vec![0; w * h];
         self.draw(view, shot, &mut data, w);

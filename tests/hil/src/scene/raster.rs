@@ -30,7 +30,7 @@ impl Rect {
         self.y1 - self.y0
     }
 
-    /// Smallest rectangle that holds the points, grown by `margin` pixels and cut to a picture; `None` when nothing is left.
+    /// Smallest rectangle that holds the points, grown by `margin` pixels and cut to an image; `None` when nothing is left.
     pub(super) fn around(
         points: impl IntoIterator<Item = Pixel>,
         margin: f64,
@@ -107,7 +107,7 @@ impl Coverage {
         Some(r)
     }
 
-    /// Coverage of row `y` of the picture inside the rectangle of the last [`Self::fill`].
+    /// Coverage of row `y` of the image inside the rectangle of the last [`Self::fill`].
     pub(super) fn row(&self, y: usize) -> &[f32] {
         match self.rect {
             Some(r) if (r.y0..r.y1).contains(&y) => {

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 pub struct Sensor {
     /// Standard deviation of the Gaussian point spread (on top of the pixel's own square), px.
     pub blur_px: f64,
-    /// Loss of light in the picture's corner, 0 to 1.
+    /// Loss of light in the image's corner, 0 to 1.
     pub vignetting: f64,
     /// Noise that does not depend on light, grey values.
     pub read_noise: f64,
@@ -31,7 +31,7 @@ pub(super) const SCALE: f32 = 64.0;
 const UNIT: f32 = 2048.0;
 const TABLE: usize = 1 << 18;
 
-/// Unit normal numbers drawn once; a picture reads them from a fresh place for every row.
+/// Unit normal numbers drawn once; an image reads them from a fresh place for every row.
 #[derive(Debug)]
 pub struct Noise {
     table: Vec<i16>,

@@ -1,4 +1,4 @@
-//! One camera's picture: the fixed layers, the gripper drawn into them, the sensor.
+//! One camera's image: the fixed layers, the gripper drawn into them, the sensor.
 
 use super::body::Body;
 use super::layers::{Layers, blur};
@@ -32,12 +32,12 @@ struct Work {
     gripper: Vec<[f32; 3]>,
     /// One solid at a time: grey times coverage, coverage.
     solid: Vec<[f32; 2]>,
-    picture: Vec<f32>,
+    image: Vec<f32>,
     blur: Vec<f32>,
     row: (Vec<i16>, Vec<i16>),
 }
 
-/// The moving part of one picture.
+/// The moving part of one image.
 #[derive(Clone, Copy, Debug)]
 pub struct Moving<'a> {
     /// The gripper.
@@ -62,12 +62,12 @@ impl ViewRenderer {
         &self.camera
     }
 
-    /// Draws the picture without noise nor gripper: what a long average would show.
+    /// Draws the image without noise nor gripper: what a long average would show.
     pub fn still(&self) -> Vec<u8> {
         self.layers.exposed.0.iter().map(|v| ((v + 32) >> 6).clamp(0, 255) as u8).collect()
     }
 
-    /// Draws one picture into rows of `stride` bytes. `frame` numbers the pictures: the same number gives the same noise.
+    /// Draws one image into rows of `stride` bytes. `frame` numbers the images: the same number gives the same noise.
     pub fn draw(
         &mut self,
         stage: &Stage,
@@ -91,7 +91,7 @@ impl ViewRenderer {
                     expose(&mut row[..x0], &v[..x0], &a[..x0], &numbers[..x0]);
                     expose(&mut row[x1..], &v[x1..], &a[x1..], &numbers[x1..]);
                     let at = (y - r.y0) * r.width();
-                    let src = &self.work.picture[at + x0 - r.x0..at + x1 - r.x0];
+                    let src = &self.work.image[at + x0 - r.x0..at + x1 - r.x0];
                     let (rv, ra) = &mut self.work.row;
                     rv.clear();
                     rv.extend(src.iter().map(|g| (g * SCALE).clamp(0.0, 20_000.0) as i16));
@@ -104,7 +104,7 @@ impl ViewRenderer {
         }
     }
 
-    /// Draws the gripper over the fixed layers and blurs: the rectangle that `work.picture` holds, and the part of it that is
+    /// Draws the gripper over the fixed layers and blurs: the rectangle that `work.image` holds, and the part of it that is
     /// blurred right (nearer to its border the blur lacked the neighbours).
     fn draw_gripper(&mut self, stage: &Stage, m: &Moving<'_>) -> Option<(Rect, Rect)> {
         let (w, h) = (self.layers.width, self.layers.height);
@@ -138,14 +138,14 @@ impl ViewRenderer {
             );
         }
         // Compose: valve over gripper where it is nearer, else gripper over valve, both over the backdrop.
-        work.picture.clear();
+        work.image.clear();
         for y in region.y0..region.y1 {
             let g = &work.gripper[(y - region.y0) * rw..(y - region.y0 + 1) * rw];
             let at = y * w + region.x0;
             let (back, fall) = (&self.layers.backdrop[at..at + rw], &self.layers.falloff[at..at + rw]);
             for (i, ((g, b), f)) in g.iter().zip(back).zip(fall).enumerate() {
                 let grey = g[0] * f;
-                work.picture.push(match self.layers.valve_at(region.x0 + i, y) {
+                work.image.push(match self.layers.valve_at(region.x0 + i, y) {
                     Some((v, _)) if v[1] > 0.0 => {
                         if v[2] < g[2] {
                             v[0] + (1.0 - v[1]) * (grey + (1.0 - g[1]) * b)
@@ -157,7 +157,7 @@ impl ViewRenderer {
                 });
             }
         }
-        blur(&mut work.picture, rw, &self.kernel, &mut work.blur);
+        blur(&mut work.image, rw, &self.kernel, &mut work.blur);
         let n = self.kernel.len() - 1;
         let inner = Rect {
             x0: if region.x0 == 0 { 0 } else { region.x0 + n },

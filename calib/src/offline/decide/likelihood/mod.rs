@@ -78,7 +78,7 @@ pub(in crate::offline) struct Hypothesis {
     /// The shapes that the stretches belong to.
     pub(in crate::offline) shapes: Vec<Shape>,
     /// Standard deviation, pixels, of how far a contour of the right image lies from where the left one's shape puts
-    /// it, across and in height over the epipolar lines. `None` if both are pictures of one shape.
+    /// it, across and in height over the epipolar lines. `None` if both are images of one shape.
     pub(in crate::offline) unrelated_px: Option<f64>,
 }
 

@@ -1,4 +1,4 @@
-//! What contours may be pictures of: a plane circle or ellipse, a round bar; where their outlines lie, and how
+//! What contours may be images of: a plane circle or ellipse, a round bar; where their outlines lie, and how
 //! parameters move them.
 
 use crate::offline::bar::torus::{Torus, rays};
@@ -15,7 +15,7 @@ const BAR_SPREAD: f64 = 0.6;
 /// Parameters of a shape at most.
 pub(super) const SHAPE: usize = 8;
 
-/// What a set of contours is a picture of.
+/// What a set of contours is an image of.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(in crate::offline) enum Shape {
     /// A plane circle.

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 /// Two simulated cameras: renders valve, gripper and marks for the arm's true joints and publishes stereo pairs like a camera driver.
 ///
-/// The arm's joints come from a UR controller (or the mock) as a second, read-only RTDE client. When pictures flow it prints one
+/// The arm's joints come from a UR controller (or the mock) as a second, read-only RTDE client. When images flow it prints one
 /// line of JSON. It takes lines of JSON on standard input (and on --control-port): {"ask":"truth"}, {"ask":"status"},
 /// {"fault":"freeze"}, {"ask":"faults"}, {"clear":true}, {"quit":true}.
 #[derive(Parser, Debug, Clone)]
@@ -23,8 +23,8 @@ pub struct Args {
     #[arg(long, value_name = "DIR", requires = "seed")]
     pub make_world: Option<PathBuf>,
     /// Write left.png and right.png of the start into this folder and end
-    #[arg(long, value_name = "DIR")]
-    pub pictures: Option<PathBuf>,
+    #[arg(long, alias = "pictures", value_name = "DIR")]
+    pub images: Option<PathBuf>,
     /// RTDE port of the controller whose arm is shown
     #[arg(long, value_name = "HOST:PORT", conflicts_with = "joints")]
     pub rtde: Option<String>,

@@ -7,13 +7,13 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "fault", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Fault {
-    /// Same picture again and again while stamps and sequence go on (C03); `eye` 0 left, 1 right, both without.
+    /// Same image again and again while stamps and sequence go on (C03); `eye` 0 left, 1 right, both without.
     Freeze {
         /// Which eye.
         #[serde(default)]
         eye: Option<usize>,
     },
-    /// One eye's picture and stamp stand still (C01); without `eye` nothing is published at all (C02).
+    /// One eye's image and stamp stand still (C01); without `eye` nothing is published at all (C02).
     Stop {
         /// Which eye.
         #[serde(default)]
@@ -36,9 +36,9 @@ pub enum Fault {
         /// Milliseconds.
         ms: f64,
     },
-    /// Left and right pictures change places; with `ids` the camera ids as well (C07).
+    /// Left and right images change places; with `ids` the camera ids as well (C07).
     Swap {
-        /// Whether the ids go with the pictures.
+        /// Whether the ids go with the images.
         #[serde(default)]
         ids: bool,
     },
@@ -50,7 +50,7 @@ pub enum Fault {
         /// Its value; for `offset`, `size` and `camera_id` the right eye's.
         value: u64,
     },
-    /// Part of a picture is missing; flagged unless `silent` (C09).
+    /// Part of an image is missing; flagged unless `silent` (C09).
     Incomplete {
         /// Which eye.
         #[serde(default)]
@@ -118,7 +118,7 @@ pub enum Fault {
     },
     /// Everything of the gripper is hidden (M02).
     HideGripper {},
-    /// Two marks change places in the pictures: each window shows the other's surroundings (M03).
+    /// Two marks change places in the images: each window shows the other's surroundings (M03).
     SwapMarks {
         /// One.
         a: usize,
@@ -156,9 +156,9 @@ pub enum Fault {
         /// Pixels down.
         dv: i64,
     },
-    /// The gripper's picture stands still while the arm moves; noise goes on (M09).
+    /// The gripper's image stands still while the arm moves; noise goes on (M09).
     HoldPose {},
-    /// White noise instead of pictures (M07).
+    /// White noise instead of images (M07).
     WhiteNoise {},
     /// A second publisher sends pairs of its own (H06).
     SecondPublisher {},
@@ -201,11 +201,11 @@ impl Timed {
 }
 
 impl Fault {
-    /// Changes a finished picture (eye 0 or 1) of `w` times `h` bytes.
-    pub(super) fn spoil(&self, eye: usize, picture: &mut [u8], w: usize, h: usize, t_s: f64, key: u64) {
+    /// Changes a finished image (eye 0 or 1) of `w` times `h` bytes.
+    pub(super) fn spoil(&self, eye: usize, image: &mut [u8], w: usize, h: usize, t_s: f64, key: u64) {
         match self {
             Fault::Incomplete { eye: e, .. } if *e == eye => {
-                for row in picture.chunks_exact_mut(w).skip(h / 2).step_by(3) {
+                for row in image.chunks_exact_mut(w).skip(h / 2).step_by(3) {
                     row.fill(0);
                 }
             }
@@ -215,14 +215,14 @@ impl Fault {
                 } else {
                     *factor
                 };
-                map(picture, |g| g * k);
+                map(image, |g| g * k);
             }
-            Fault::Fog { share, grey } => map(picture, |g| g + share.clamp(0.0, 1.0) * (grey - g)),
-            Fault::Blur { px } => box_blur(picture, w, h, (*px).min(40)),
-            Fault::Shift { eye: e, du, dv } if *e == eye => shift(picture, w, h, *du, *dv),
+            Fault::Fog { share, grey } => map(image, |g| g + share.clamp(0.0, 1.0) * (grey - g)),
+            Fault::Blur { px } => box_blur(image, w, h, (*px).min(40)),
+            Fault::Shift { eye: e, du, dv } if *e == eye => shift(image, w, h, *du, *dv),
             Fault::WhiteNoise {} => {
                 let mut k = key | 1;
-                for p in picture {
+                for p in image {
                     k ^= k << 13;
                     k ^= k >> 7;
                     k ^= k << 17;
@@ -273,12 +273,12 @@ impl Fault {
     }
 }
 
-fn map(picture: &mut [u8], f: impl Fn(f64) -> f64) {
+fn map(image: &mut [u8], f: impl Fn(f64) -> f64) {
     let table: [u8; 256] = std::array::from_fn(|g| f(g as f64).round().clamp(0.0, 255.0) as u8);
-    picture.iter_mut().for_each(|p| *p = table[usize::from(*p)]);
+    image.iter_mut().for_each(|p| *p = table[usize::from(*p)]);
 }
 
-fn box_blur(picture: &mut [u8], w: usize, h: usize, half: usize) {
+fn box_blur(image: &mut [u8], w: usize, h: usize, half: usize) {
     let pass = |line: &mut dyn FnMut(usize) -> u8, n: usize, out: &mut Vec<u8>| {
         out.clear();
         let values: Vec<u32> = (0..n).map(|i| u32::from(line(i))).collect();
@@ -288,30 +288,30 @@ fn box_blur(picture: &mut [u8], w: usize, h: usize, half: usize) {
         }
     };
     let mut out = Vec::new();
-    for row in picture.chunks_exact_mut(w) {
+    for row in image.chunks_exact_mut(w) {
         pass(&mut |i| row[i], w, &mut out);
         row.copy_from_slice(&out);
     }
     for x in 0..w {
-        pass(&mut |y| picture[y * w + x], h, &mut out);
+        pass(&mut |y| image[y * w + x], h, &mut out);
         for (y, v) in out.iter().enumerate() {
-            picture[y * w + x] = *v;
+            image[y * w + x] = *v;
         }
     }
 }
 
-fn shift(picture: &mut [u8], w: usize, h: usize, du: i64, dv: i64) {
-    let src = picture.to_vec();
+fn shift(image: &mut [u8], w: usize, h: usize, du: i64, dv: i64) {
+    let src = image.to_vec();
     let at = |v: usize, d: i64, n: usize| (v as i64 - d).clamp(0, n as i64 - 1) as usize;
     for y in 0..h {
         for x in 0..w {
-            picture[y * w + x] = src[at(y, dv, h) * w + at(x, du, w)];
+            image[y * w + x] = src[at(y, dv, h) * w + at(x, du, w)];
         }
     }
 }
 
 /// Paints a disc with soft edges.
-pub(super) fn disc(picture: &mut [u8], w: usize, h: usize, centre: (f64, f64), radius: f64, grey: u8) {
+pub(super) fn disc(image: &mut [u8], w: usize, h: usize, centre: (f64, f64), radius: f64, grey: u8) {
     let reach = |c: f64, n: usize| {
         (
             (c - radius - 1.0).floor().clamp(0.0, n as f64) as usize,
@@ -322,7 +322,7 @@ pub(super) fn disc(picture: &mut [u8], w: usize, h: usize, centre: (f64, f64), r
     for y in y0..y1 {
         for x in x0..x1 {
             let k = (radius + 0.5 - (x as f64 - centre.0).hypot(y as f64 - centre.1)).clamp(0.0, 1.0);
-            let p = &mut picture[y * w + x];
+            let p = &mut image[y * w + x];
             *p = (f64::from(*p) * (1.0 - k) + f64::from(grey) * k).round() as u8;
         }
     }
@@ -349,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn pictures_are_spoilt_as_the_fault_says() {
+    fn images_are_spoilt_as_the_fault_says() {
         let (w, h) = (40, 30);
         let fresh = || (0..w * h).map(|i| (i % 200) as u8).collect::<Vec<u8>>();
         let mut p = fresh();

@@ -90,7 +90,7 @@ impl Arm {
         Some(Sample { at_ns: t_ns, q, outputs: a.outputs })
     }
 
-    /// Follows a controller until `stop`, reconnecting for ever; the pictures hold the last joints meanwhile.
+    /// Follows a controller until `stop`, reconnecting for ever; the images hold the last joints meanwhile.
     pub(super) fn follow(&self, address: String, stop: Arc<AtomicBool>) {
         let arm = self.clone();
         std::thread::spawn(move || {

@@ -45,8 +45,8 @@ enum SceneError {
     Joint(f64),
     #[error("--fault {0}: {1}")]
     Fault(String, String),
-    #[error("--pictures {0}: {1}")]
-    Picture(PathBuf, String),
+    #[error("--images {0}: {1}")]
+    GreyImage(PathBuf, String),
     #[error("--control-port {0}: {1}")]
     Port(u16, std::io::Error),
     #[error("cannot catch signals: {0}")]
@@ -100,8 +100,8 @@ fn run(args: &Args) -> Result<(), SceneError> {
     if let Some(dir) = &args.make_world {
         return Ok(scenario.save(dir)?);
     }
-    if let Some(dir) = &args.pictures {
-        return pictures(&scenario, dir);
+    if let Some(dir) = &args.images {
+        return images(&scenario, dir);
     }
     let mut q = scenario.start;
     for (q, v) in q.iter_mut().zip(args.joints.iter().flatten()) {
@@ -176,13 +176,13 @@ fn stop_flag(args: &Args) -> Result<Arc<AtomicBool>, SceneError> {
 }
 
 /// Saves what both cameras see at the start.
-fn pictures(scenario: &Scenario, dir: &Path) -> Result<(), SceneError> {
-    let bad = |e: String| SceneError::Picture(dir.to_owned(), e);
+fn images(scenario: &Scenario, dir: &Path) -> Result<(), SceneError> {
+    let bad = |e: String| SceneError::GreyImage(dir.to_owned(), e);
     std::fs::create_dir_all(dir).map_err(|e| bad(e.to_string()))?;
     let mut renderer = scenario.renderer();
     let shot = scenario.snapshot(&scenario.start, 1);
     for (view, name) in [(View::Left, "left.png"), (View::Right, "right.png")] {
-        renderer.picture(view, &shot).save(dir.join(name)).map_err(|e| bad(e.to_string()))?;
+        renderer.image(view, &shot).save(dir.join(name)).map_err(|e| bad(e.to_string()))?;
     }
     Ok(())
 }

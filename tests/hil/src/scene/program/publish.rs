@@ -1,4 +1,4 @@
-//! The publishing loop: a camera's beat, the arm at the instant of exposure, the pictures, the stamps.
+//! The publishing loop: a camera's cycle, the arm at the instant of exposure, the images, the stamps.
 
 use super::faults::{Fault, Timed, disc};
 use super::joints::{Arm, now_ns};
@@ -17,7 +17,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Serial numbers of the simulated cameras.
 pub(super) const SERIALS: [&str; 2] = ["sim-left", "sim-right"];
-/// Exposure time that is stated, ns. Pictures are of one instant: at the speeds of a servo the blur would be a fraction of a pixel.
+/// Exposure time that is stated, ns. Images are of one instant: at the speeds of a servo the blur would be a fraction of a pixel.
 const EXPOSURE_NS: u64 = 2_000_000;
 /// How long to wait for a look at the arm after the exposure, ns.
 const PATIENCE_NS: u64 = 8_000_000;
@@ -95,7 +95,7 @@ pub(super) struct Loop {
     latency_ns: u64,
     close_output: u32,
     opening: f64,
-    /// What faults hold on to: pictures and stamps of each eye, pose.
+    /// What faults hold on to: images and stamps of each eye, pose.
     held: [Option<(Vec<u8>, u64)>; 2],
     held_pose: Option<[Option<Pose>; 2]>,
     /// A renderer being made for cameras or an object that moved, and the faults it is made for.
@@ -152,7 +152,7 @@ impl Loop {
             capture += period;
             let now = now_ns();
             if capture < now.saturating_sub(self.latency_ns) {
-                // Too late for this beat: leave out whole beats and keep the grid.
+                // Too late for this cycle: leave out whole cycles and keep the grid.
                 let lost = (now - self.latency_ns - capture).div_ceil(period);
                 for _ in 0..lost.min(1000) {
                     self.publisher.skip();
@@ -210,27 +210,27 @@ impl Loop {
         let before = now_ns();
         let (w, h) = self.renderer.size();
         let mut loan = self.publisher.loan()?;
-        let (left, right) = loan.pictures();
+        let (left, right) = loan.images();
         let swap = active.iter().any(|f| matches!(f, Fault::Swap { .. }));
         let targets = if swap { [right, left] } else { [left, right] };
         for view in View::BOTH {
             let eye = view.index();
-            let picture = &mut *targets[eye];
+            let image = &mut *targets[eye];
             let freeze = active.iter().any(|f| matches!(f, Fault::Freeze { eye: e } if e.is_none_or(|e| e == eye)));
             let stopped = active.iter().any(|f| matches!(f, Fault::Stop { eye: Some(e) } if *e == eye));
             if let Some((old, stamp)) = self.held[eye].as_ref().filter(|_| freeze || stopped) {
-                picture.copy_from_slice(old);
+                image.copy_from_slice(old);
                 if stopped {
                     stamps[eye] = *stamp;
                 }
                 continue;
             }
-            self.renderer.draw(view, &shot, picture, w);
+            self.renderer.draw(view, &shot, image, w);
             for f in active {
-                f.spoil(eye, picture, w, h, t_s, trigger * 2 + eye as u64);
-                marks_fault(f, &self.scenario, view, &shot, picture, (w, h));
+                f.spoil(eye, image, w, h, t_s, trigger * 2 + eye as u64);
+                marks_fault(f, &self.scenario, view, &shot, image, (w, h));
             }
-            self.held[eye] = if freeze || stopped { Some((picture.to_vec(), stamps[eye])) } else { None };
+            self.held[eye] = if freeze || stopped { Some((image.to_vec(), stamps[eye])) } else { None };
         }
         let render_us = (now_ns() - before) as f64 * 1e-3;
         let stamp = FrameStamp {
@@ -335,7 +335,7 @@ impl Loop {
         }
         if let Some((_, p)) = &mut self.second {
             let mut loan = p.loan()?;
-            let (l, r) = loan.pictures();
+            let (l, r) = loan.images();
             l.fill(0);
             r.fill(0);
             loan.send(stamp)?;
@@ -365,7 +365,7 @@ fn displace(s: &mut Scenario, f: &Fault, sign: f64) {
 }
 
 /// Faults that need to know where marks are.
-fn marks_fault(f: &Fault, s: &Scenario, view: View, shot: &Snapshot, picture: &mut [u8], (w, h): (usize, usize)) {
+fn marks_fault(f: &Fault, s: &Scenario, view: View, shot: &Snapshot, image: &mut [u8], (w, h): (usize, usize)) {
     let at = |mark: usize| -> Option<Pixel> {
         let m = s.gripper.gripper.marks.get(mark)?;
         let left = s.left_from_object() * shot.object_from_gripper[view.index()]?;
@@ -374,19 +374,19 @@ fn marks_fault(f: &Fault, s: &Scenario, view: View, shot: &Snapshot, picture: &m
     match f {
         Fault::Blob { mark, du, dv, radius, grey } => {
             if let Some(p) = at(*mark) {
-                disc(picture, w, h, (p.x + du, p.y + dv), radius.clamp(0.5, 200.0), *grey);
+                disc(image, w, h, (p.x + du, p.y + dv), radius.clamp(0.5, 200.0), *grey);
             }
         }
         Fault::SwapMarks { a, b } => {
             if let (Some(p), Some(q)) = (at(*a), at(*b)) {
-                swap_windows(picture, (w, h), p, q, 10);
+                swap_windows(image, (w, h), p, q, 10);
             }
         }
         _ => {}
     }
 }
 
-fn swap_windows(picture: &mut [u8], (w, h): (usize, usize), p: Pixel, q: Pixel, half: i64) {
+fn swap_windows(image: &mut [u8], (w, h): (usize, usize), p: Pixel, q: Pixel, half: i64) {
     let corner = |c: Pixel| (c.x.round() as i64 - half, c.y.round() as i64 - half);
     let ((px, py), (qx, qy)) = (corner(p), corner(q));
     let index = |x: i64, y: i64| {
@@ -396,7 +396,7 @@ fn swap_windows(picture: &mut [u8], (w, h): (usize, usize), p: Pixel, q: Pixel, 
     for j in 0..=2 * half {
         for i in 0..=2 * half {
             if let (Some(a), Some(b)) = (index(px + i, py + j), index(qx + i, qy + j)) {
-                picture.swap(a, b);
+                image.swap(a, b);
             }
         }
     }

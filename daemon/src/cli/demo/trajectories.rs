@@ -1,4 +1,4 @@
-//! The ways of the marks in both pictures during the servo: the paper's figure 8.
+//! The ways of the marks in both images during the servo: the paper's figure 8.
 
 use super::watch::Trajectories;
 use crate::exit::Failure;
@@ -6,7 +6,7 @@ use graspd_calib::offline::drawing::canvas::{Canvas, Face, Rgba};
 use graspd_rt::geom::Pixel;
 use std::path::Path;
 
-/// Height of the strip with the title and the error curve under the pictures, px.
+/// Height of the strip with the title and the error curve under the images, px.
 const TITLE: f64 = 46.0;
 const CURVE: f64 = 190.0;
 const GAP: f64 = 8.0;
@@ -25,18 +25,18 @@ const COLOURS: [Rgba; 10] = [
     [220, 220, 160, 255],
 ];
 
-/// Draws `trajectories.png` over the first pictures in `folder`.
+/// Draws `trajectories.png` over the first images in `folder`.
 ///
 /// # Errors
-/// When the pictures cannot be read or the drawing cannot be written.
-pub(super) fn trajectories(folder: &Path, t: &Trajectories) -> Result<(), Failure> {
+/// When the images cannot be read or the drawing cannot be written.
+pub(super) fn draw(folder: &Path, t: &Trajectories) -> Result<(), Failure> {
     let out = folder.join("trajectories.png");
     let fail = |e: String| Failure::input(format!("{}: cannot be drawn ({e})", out.display()));
-    let mut pictures = Vec::new();
+    let mut images = Vec::new();
     for name in ["left.png", "right.png"] {
-        pictures.push(image::open(folder.join(name)).map_err(|e| fail(e.to_string()))?.into_luma8());
+        images.push(image::open(folder.join(name)).map_err(|e| fail(e.to_string()))?.into_luma8());
     }
-    let (w, h) = (f64::from(pictures[0].width()), f64::from(pictures[0].height()));
+    let (w, h) = (f64::from(images[0].width()), f64::from(images[0].height()));
     let scale = 800.0 / w;
     let (vw, vh) = (800.0, (h * scale).round());
     let (width, height) = (2.0 * vw + 3.0 * GAP, TITLE + vh + CURVE + 2.0 * GAP);
@@ -47,8 +47,8 @@ pub(super) fn trajectories(folder: &Path, t: &Trajectories) -> Result<(), Failur
             Pixel::new(GAP + eye as f64 * (vw + GAP) + f64::from(p[0]) * scale, TITLE + f64::from(p[1]) * scale)
         })
     };
-    for (eye, picture) in pictures.iter().enumerate() {
-        place(&mut canvas, picture, GAP + eye as f64 * (vw + GAP), vw as u32, vh as u32);
+    for (eye, image) in images.iter().enumerate() {
+        place(&mut canvas, image, GAP + eye as f64 * (vw + GAP), vw as u32, vh as u32);
         for (i, way) in t.points[eye].iter().enumerate() {
             let colour = COLOURS[i % COLOURS.len()];
             let points: Vec<Option<Pixel>> = way.iter().map(|p| at(eye, *p)).collect();
@@ -84,9 +84,9 @@ pub(super) fn trajectories(folder: &Path, t: &Trajectories) -> Result<(), Failur
     std::fs::write(&out, png).map_err(|e| fail(e.to_string()))
 }
 
-/// A grey picture, dimmed so that lines stand out.
-fn place(canvas: &mut Canvas, picture: &image::GrayImage, x: f64, width: u32, height: u32) {
-    let small = image::imageops::resize(picture, width, height, image::imageops::FilterType::Triangle);
+/// A grey image, dimmed so that lines stand out.
+fn place(canvas: &mut Canvas, image: &image::GrayImage, x: f64, width: u32, height: u32) {
+    let small = image::imageops::resize(image, width, height, image::imageops::FilterType::Triangle);
     let Some(mut view) = Canvas::new(width, height, [0, 0, 0, 255]) else { return };
     view.grey(small.as_raw(), 0.7);
     canvas.place(x as i32, TITLE as i32, &view);

@@ -1,4 +1,4 @@
-//! Whatever the pictures, stamps, poses and rigs are: no panic, no endless loop, and nothing that is not finite.
+//! Whatever the images, stamps, poses and rigs are: no panic, no endless loop, and nothing that is not finite.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod support;
@@ -20,7 +20,7 @@ fn small_rig() -> graspd_rt::geom::Rig {
     r
 }
 
-fn picture(kind: u8, seed: u64, width: usize, height: usize) -> Vec<u8> {
+fn image(kind: u8, seed: u64, width: usize, height: usize) -> Vec<u8> {
     let mut random = Random(seed);
     let (a, b) = (random.bits() as u8, random.bits() as u8);
     let (p, q) = (1 + (random.bits() % 40) as usize, 1 + (random.bits() % 40) as usize);
@@ -86,8 +86,8 @@ proptest! {
     ) {
         let rig = small_rig();
         let mut cycle = VisionCycle::new(rig, gripper(), VisionSettings::default());
-        let pictures = [picture(kinds[0], seed, 320, 256), picture(kinds[1], seed ^ 1, 320, 256)];
-        let view = |i: usize| ImageView::new(&pictures[i], 320, 256, 320).unwrap();
+        let images = [image(kinds[0], seed, 320, 256), image(kinds[1], seed ^ 1, 320, 256)];
+        let view = |i: usize| ImageView::new(&images[i], 320, 256, 320).unwrap();
         for k in 0..3 {
             if k != 1 {
                 cycle.seed(start);
@@ -111,8 +111,8 @@ proptest! {
     fn acquisition_survives_anything(kinds in prop::array::uniform2(any::<u8>()), seed in any::<u64>(), stride in 0_usize..9) {
         let rig = small_rig();
         let gripper = gripper();
-        let pictures = [picture(kinds[0], seed, 320 + stride, 256), picture(kinds[1], seed ^ 1, 320 + stride, 256)];
-        let view = |i: usize| ImageView::new(&pictures[i], 320, 256, 320 + stride).unwrap();
+        let images = [image(kinds[0], seed, 320 + stride, 256), image(kinds[1], seed ^ 1, 320 + stride, 256)];
+        let view = |i: usize| ImageView::new(&images[i], 320, 256, 320 + stride).unwrap();
         let mut scratch = Box::new(AcquireScratch::new());
         if let Ok(a) = acquire(&rig, &gripper, &view(0), &view(1), &AcquireSettings::default(), &mut scratch) {
             prop_assert!(a.left_from_gripper.translation.vector.iter().all(|x| x.is_finite()));

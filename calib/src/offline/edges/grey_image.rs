@@ -1,20 +1,20 @@
-//! A grey picture, from a file or from a live frame, and how noisy it is.
+//! A grey image, from a file or from a live frame, and how noisy it is.
 
 use crate::files::{ContentHash, FileError};
 use graspd_rt::geom::Pixel;
 use graspd_rt::image::ImageView;
 use std::path::Path;
 
-/// An owned grey picture of eight bits a pixel, rows without padding.
+/// An owned grey image of eight bits a pixel, rows without padding.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Picture {
+pub struct GreyImage {
     width: usize,
     height: usize,
     data: Vec<u8>,
 }
 
-impl Picture {
-    /// A picture from its grey values, row by row; `None` when their number is not `width * height` or a side is zero or absurd.
+impl GreyImage {
+    /// An image from its grey values, row by row; `None` when their number is not `width * height` or a side is zero or absurd.
     pub fn new(width: usize, height: usize, data: Vec<u8>) -> Option<Self> {
         (data.len() == width.checked_mul(height)? && ImageView::new(&data, width, height, width).is_some())
             .then_some(Self { width, height, data })
@@ -31,7 +31,7 @@ impl Picture {
         let refuse = |reason: String| FileError::Read {
             path: path.display().to_string(),
             reason,
-            fix: "give a PNG, JPEG or PGM picture".to_owned(),
+            fix: "give a PNG, JPEG or PGM image".to_owned(),
         };
         let reader = image::ImageReader::open(path)
             .map_err(|e| refuse(e.to_string()))?
@@ -40,7 +40,7 @@ impl Picture {
         let grey = reader.decode().map_err(|e| refuse(e.to_string()))?.into_luma8();
         let (w, h) = (grey.width() as usize, grey.height() as usize);
         Self::new(w, h, grey.into_raw())
-            .ok_or_else(|| refuse(format!("its size {w}x{h} is not that of a camera picture")))
+            .ok_or_else(|| refuse(format!("its size {w}x{h} is not that of a camera image")))
     }
 
     /// Width, pixels.
@@ -73,7 +73,7 @@ impl Picture {
         ContentHash::of(&self.data)
     }
 
-    /// Whether a pixel lies in the picture by at least `margin`.
+    /// Whether a pixel lies in the image by at least `margin`.
     pub fn contains(&self, p: Pixel, margin: f64) -> bool {
         p.x >= margin
             && p.y >= margin
@@ -124,7 +124,7 @@ mod tests {
     use rand_distr::{Distribution, Normal};
 
     #[test]
-    fn noise_is_measured_on_a_picture_with_edges() {
+    fn noise_is_measured_on_a_image_with_edges() {
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(3);
         for sigma in [1.0, 2.5, 6.0] {
             let n = Normal::new(0.0, sigma).unwrap();
@@ -135,16 +135,16 @@ mod tests {
                     (base + n.sample(&mut rng)).round().clamp(0.0, 255.0) as u8
                 })
                 .collect();
-            let got = Picture::new(300, 200, data).unwrap().noise();
+            let got = GreyImage::new(300, 200, data).unwrap().noise();
             assert!((got / sigma - 1.0).abs() < 0.15, "{sigma} {got}");
         }
     }
 
     #[test]
-    fn a_wrong_size_is_no_picture() {
-        assert!(Picture::new(3, 3, vec![0; 8]).is_none());
-        assert!(Picture::new(0, 3, vec![]).is_none());
-        let e = Picture::load(Path::new("no/such.png")).unwrap_err().to_string();
+    fn a_wrong_size_is_no_image() {
+        assert!(GreyImage::new(3, 3, vec![0; 8]).is_none());
+        assert!(GreyImage::new(0, 3, vec![]).is_none());
+        let e = GreyImage::load(Path::new("no/such.png")).unwrap_err().to_string();
         assert!(e.contains("no/such.png") && e.contains("PNG"));
     }
 }

@@ -1,4 +1,4 @@
-//! Draws a scenario's first pictures: `cargo run --release -p graspd-hil --example scene_pictures -- SEED FOLDER`.
+//! Draws a scenario's first images: `cargo run --release -p graspd-hil --example scene_images -- SEED FOLDER`.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::scenario::{Options, Scenario};
@@ -8,7 +8,7 @@ use std::time::Instant;
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut args = std::env::args().skip(1);
     let seed = args.next().map_or(Ok(1), |s| s.parse())?;
-    let dir = std::path::PathBuf::from(args.next().unwrap_or_else(|| "scene-pictures".into()));
+    let dir = std::path::PathBuf::from(args.next().unwrap_or_else(|| "scene-images".into()));
     let start = Instant::now();
     let scenario = Scenario::from_seed(seed, &Options::default())?;
     eprintln!("drawn in {:.2} s", start.elapsed().as_secs_f64());
@@ -22,9 +22,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut near = shot;
     near.object_from_gripper = [Some(scenario.object_from_grasp(graspd_hil::scenario::STANDOFF_M)); 2];
     for (view, name) in [(View::Left, "left"), (View::Right, "right")] {
-        renderer.picture(view, &shot).save(dir.join(format!("{name}.png")))?;
-        renderer.picture(view, &grasp).save(dir.join(format!("{name}-grasp.png")))?;
-        renderer.picture(view, &near).save(dir.join(format!("{name}-pregrasp.png")))?;
+        renderer.image(view, &shot).save(dir.join(format!("{name}.png")))?;
+        renderer.image(view, &grasp).save(dir.join(format!("{name}-grasp.png")))?;
+        renderer.image(view, &near).save(dir.join(format!("{name}-pregrasp.png")))?;
     }
     let (w, h) = renderer.size();
     let mut buffer = vec![0; w * h];

@@ -1,11 +1,11 @@
-//! The off-line stage on the simulator's pictures: from one click a view to the rim, against the truth.
+//! The off-line stage on the simulator's images: from one click a view to the rim, against the truth.
 //!
 //! `GRASPD_WORLDS=100` runs more of each kind and prints the 95 % figures (the example `judge_cells` does the same by every click, choice of rim and rig error).
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::RigFile;
 use graspd_calib::offline::contour::select::Selection;
-use graspd_calib::offline::edges::picture::Picture;
+use graspd_calib::offline::edges::grey_image::GreyImage;
 use graspd_calib::offline::plan::{Plan, PlanError, PlanOptions, plan};
 use graspd_calib::offline::rim::model::{RimChoice, RimModel};
 use graspd_hil::scenario::{Options, Scenario};
@@ -17,11 +17,11 @@ fn worlds(few: u64) -> u64 {
     std::env::var("GRASPD_WORLDS").ok().and_then(|v| v.parse().ok()).unwrap_or(few)
 }
 
-fn pictures(s: &Scenario, shot: &Snapshot) -> [Picture; 2] {
+fn images(s: &Scenario, shot: &Snapshot) -> [GreyImage; 2] {
     let mut renderer = s.renderer();
     View::BOTH.map(|v| {
-        let p = renderer.picture(v, shot);
-        Picture::new(p.width() as usize, p.height() as usize, p.into_raw()).unwrap()
+        let p = renderer.image(v, shot);
+        GreyImage::new(p.width() as usize, p.height() as usize, p.into_raw()).unwrap()
     })
 }
 
@@ -37,14 +37,14 @@ fn errors(s: &Scenario, p: &Plan, z: f64) -> (f64, f64) {
 fn run(s: &Scenario, shot: &Snapshot, clicks: [Pixel; 2], rim: RimChoice) -> Result<Plan, PlanError> {
     let mut options = PlanOptions::default();
     options.rim.rim = rim;
-    let pair = pictures(s, shot);
+    let pair = images(s, shot);
     let rig = RigFile::new(s.given_rig);
     let selections = clicks.map(Selection::Click);
     // The wheel may be wider than the jaws; what is tested here is the rim.
     let mut gripper = s.gripper.clone();
     gripper.opening[1] = 1.0;
     let found = plan([&pair[0], &pair[1]], [&selections[0], &selections[1]], &rig, &gripper, &options);
-    if let (Ok(p), Ok(dir)) = (&found, std::env::var("GRASPD_PICTURES")) {
+    if let (Ok(p), Ok(dir)) = (&found, std::env::var("GRASPD_IMAGES")) {
         let png =
             graspd_calib::offline::drawing::overlay::draw(p, [&pair[0], &pair[1]], &rig, &gripper).unwrap_or_default();
         let _ = std::fs::write(format!("{dir}/world-{}-{rim:?}.png", s.seed), png);

@@ -1,4 +1,4 @@
-//! A fixed-rate beat on absolute deadlines.
+//! A fixed-rate cycle on absolute deadlines.
 
 use rustix::thread::{ClockId, clock_nanosleep_absolute};
 use rustix::time::{Timespec, clock_gettime};
@@ -9,14 +9,14 @@ pub fn now_ns() -> u64 {
     u64::try_from(t.tv_sec).unwrap_or(0) * 1_000_000_000 + u64::try_from(t.tv_nsec).unwrap_or(0)
 }
 
-/// One beat, as it really came.
+/// One cycle, as it really came.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Tick {
     /// When the thread should have woken.
     pub deadline_ns: u64,
     /// When it woke.
     pub woke_ns: u64,
-    /// Whole periods of the grid that were missed since the last beat; 0 in good health.
+    /// Whole periods of the grid that were missed since the last cycle; 0 in good health.
     pub skipped: u64,
 }
 
@@ -27,16 +27,16 @@ impl Tick {
     }
 }
 
-/// A periodic beat that keeps its grid: a late beat is counted, never caught up with a burst.
+/// A periodic cycle that keeps its grid: a late cycle is counted, never caught up with a burst.
 #[derive(Debug)]
-pub struct Beat {
+pub struct CycleTimer {
     period_ns: u64,
     spin_ns: u64,
     next_ns: u64,
 }
 
-impl Beat {
-    /// A beat of this period, the first one a period from now. With `spin_ns` above zero the thread wakes that much earlier and
+impl CycleTimer {
+    /// A cycle of this period, the first one a period from now. With `spin_ns` above zero the thread wakes that much earlier and
     /// spins to the deadline; it must stay a small share of the period (the kernel throttles FIFO threads that never sleep).
     pub fn new(period_ns: u64, spin_ns: u64) -> Self {
         let period_ns = period_ns.max(1);
@@ -64,7 +64,7 @@ pub fn sleep_until(until_ns: u64) {
         tv_nsec: i64::try_from(until_ns % 1_000_000_000).unwrap_or(0),
     };
     // EINTR returns early; the deadline stands, so ask again. Any other error cannot happen for a valid time on this clock,
-    // and falling through then only makes this beat early, never the next one late.
+    // and falling through then only makes this cycle early, never the next one late.
     while let Err(rustix::io::Errno::INTR) = clock_nanosleep_absolute(ClockId::Monotonic, &ts) {}
 }
 
@@ -74,13 +74,13 @@ mod tests {
 
     #[test]
     fn the_grid_is_kept_after_a_stall() {
-        let mut b = Beat::new(2_000_000, 0);
+        let mut b = CycleTimer::new(2_000_000, 0);
         let first = b.wait();
         std::thread::sleep(std::time::Duration::from_millis(9));
         let late = b.wait();
         assert!(late.skipped >= 2, "a stall of 4.5 periods skips whole periods: {late:?}");
         let next = b.wait();
         assert_eq!((next.deadline_ns - first.deadline_ns) % 2_000_000, 0, "deadlines stay on one grid");
-        assert!(next.deadline_ns > late.woke_ns, "no burst of beats to catch up");
+        assert!(next.deadline_ns > late.woke_ns, "no burst of cycles to catch up");
     }
 }

@@ -1,9 +1,9 @@
-//! Plane ellipses and circles of paint in rendered pictures: found by one click a view, right, and not mistaken for bars.
+//! Plane ellipses and circles of paint in rendered images: found by one click a view, right, and not mistaken for bars.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::{GripperFile, RigFile};
 use graspd_calib::offline::contour::select::Selection;
-use graspd_calib::offline::edges::picture::Picture;
+use graspd_calib::offline::edges::grey_image::GreyImage;
 use graspd_calib::offline::plan::{Plan, PlanError, PlanOptions, plan};
 use graspd_calib::offline::rim::model::{Rim, RimModel};
 use graspd_calib::offline::rim::synthetic::{Random, rim_tilted};
@@ -31,7 +31,7 @@ rotation_vector_rad = [0.0, 0.3302, 0.0]
 "#;
 
 /// A painted disc on a darker board that fills the view, through a lens of 0.6 px blur, with 2 grey levels of noise.
-fn picture(rig: &RigFile, view: View, rim: &Rim, r: &mut Random) -> Picture {
+fn image(rig: &RigFile, view: View, rim: &Rim, r: &mut Random) -> GreyImage {
     const FINE: usize = 4;
     let camera = rig.rig.camera(view);
     let from_left = rig.rig.view_from_left(view);
@@ -67,18 +67,18 @@ fn picture(rig: &RigFile, view: View, rim: &Rim, r: &mut Random) -> Picture {
     };
     let soft = blur(&blur(&covered, 1), w);
     let grey = soft.iter().map(|c| (60.0 + 110.0 * c + 2.0 * r.normal()).round().clamp(0.0, 255.0) as u8).collect();
-    Picture::new(w, h, grey).unwrap()
+    GreyImage::new(w, h, grey).unwrap()
 }
 
 fn planned(rig: &RigFile, gripper: &GripperFile, rim: &Rim, r: &mut Random) -> Result<Plan, PlanError> {
-    let pictures = View::BOTH.map(|v| picture(rig, v, rim, r));
+    let images = View::BOTH.map(|v| image(rig, v, rim, r));
     // On the rim, where the two views agree roughly, and a pixel beside it as a hand is.
     let point = rim.centre + rim.axis_b * rim.b;
     let click = View::BOTH.map(|v| {
         let p = rig.rig.project(v, &point).unwrap();
         Selection::Click(Pixel::new(p.x + r.uniform(-1.5, 1.5), p.y + r.uniform(-1.5, 1.5)))
     });
-    plan([&pictures[0], &pictures[1]], [&click[0], &click[1]], rig, gripper, &PlanOptions::default())
+    plan([&images[0], &images[1]], [&click[0], &click[1]], rig, gripper, &PlanOptions::default())
 }
 
 #[test]
