@@ -77,40 +77,40 @@ fn every_lie_is_refused_under_its_own_name() {
     assert!(s.newest(now_ns()).frame.is_some());
 
     type Edit = fn(&mut StereoHeader);
-    let lies: [(Reject, Edit); 26] = [
-        (Reject::Magic, |h| h.magic ^= 1),
-        (Reject::Version, |h| h.layout_version = 2),
-        (Reject::HeaderSize, |h| h.header_size = 128),
-        (Reject::Torn, |h| h.sequence_end -= 1),
-        (Reject::Format, |h| h.pixel_format = 0),
-        (Reject::Format, |h| h.pixel_format = 99),
-        (Reject::Size, |h| h.width = 0),
-        (Reject::Size, |h| h.width = 1 << 31),
-        (Reject::Size, |h| h.height = u32::MAX),
-        (Reject::Size, |h| h.height -= 1),
-        (Reject::Stride, |h| h.stride = W - 1),
-        (Reject::Stride, |h| h.stride = u32::MAX),
-        (Reject::Bounds, |h| h.stride += 1),
-        (Reject::Bounds, |h| h.offset[1] += 1),
-        (Reject::Bounds, |h| h.offset[1] = u64::MAX - 5),
-        (Reject::Bounds, |h| h.size[0] = u64::MAX),
-        (Reject::Bounds, |h| h.size[1] = 10),
-        (Reject::Overlap, |h| h.offset[1] = 5),
-        (Reject::Incomplete, |h| h.flags = flags::INCOMPLETE_RIGHT),
-        (Reject::Future, |h| h.capture_ns[1] += 3_600_000_000_000),
-        (Reject::Future, |h| h.capture_ns[0] = 0),
-        (Reject::Stale, |h| h.capture_ns = h.capture_ns.map(|t| t - 1_500_000_000)),
-        (Reject::Skew, |h| h.capture_ns[0] -= 8_000_000),
-        (Reject::Sequence, |h| (h.sequence, h.sequence_end) = (1, 1)),
-        (Reject::Cameras, |h| h.camera_id.swap(0, 1)),
-        (Reject::Calibration, |h| h.calibration_id = id_hash("other")),
+    let lies: [(FrameError, Edit); 26] = [
+        (FrameError::Magic, |h| h.magic ^= 1),
+        (FrameError::Version, |h| h.layout_version = 2),
+        (FrameError::HeaderSize, |h| h.header_size = 128),
+        (FrameError::Torn, |h| h.sequence_end -= 1),
+        (FrameError::Format, |h| h.pixel_format = 0),
+        (FrameError::Format, |h| h.pixel_format = 99),
+        (FrameError::Size, |h| h.width = 0),
+        (FrameError::Size, |h| h.width = 1 << 31),
+        (FrameError::Size, |h| h.height = u32::MAX),
+        (FrameError::Size, |h| h.height -= 1),
+        (FrameError::Stride, |h| h.stride = W - 1),
+        (FrameError::Stride, |h| h.stride = u32::MAX),
+        (FrameError::Bounds, |h| h.stride += 1),
+        (FrameError::Bounds, |h| h.offset[1] += 1),
+        (FrameError::Bounds, |h| h.offset[1] = u64::MAX - 5),
+        (FrameError::Bounds, |h| h.size[0] = u64::MAX),
+        (FrameError::Bounds, |h| h.size[1] = 10),
+        (FrameError::Overlap, |h| h.offset[1] = 5),
+        (FrameError::Incomplete, |h| h.flags = flags::INCOMPLETE_RIGHT),
+        (FrameError::Future, |h| h.capture_ns[1] += 3_600_000_000_000),
+        (FrameError::Future, |h| h.capture_ns[0] = 0),
+        (FrameError::Stale, |h| h.capture_ns = h.capture_ns.map(|t| t - 1_500_000_000)),
+        (FrameError::Skew, |h| h.capture_ns[0] -= 8_000_000),
+        (FrameError::Sequence, |h| (h.sequence, h.sequence_end) = (1, 1)),
+        (FrameError::Cameras, |h| h.camera_id.swap(0, 1)),
+        (FrameError::Calibration, |h| h.calibration_id = id_hash("other")),
     ];
     let mut before = s.stats().rejected;
     for (k, (want, edit)) in lies.into_iter().enumerate() {
         p.loan().unwrap().send_with(&stamp(), edit).unwrap();
         let got = s.newest(now_ns());
         assert!(got.frame.is_none(), "lie {k}");
-        assert_eq!(got.last_reject, Some(want), "lie {k}");
+        assert_eq!(got.last_error, Some(want), "lie {k}");
         before[want as usize] += 1;
         assert_eq!(s.stats().rejected, before, "lie {k}");
     }
@@ -119,7 +119,7 @@ fn every_lie_is_refused_under_its_own_name() {
     p.loan().unwrap().send(&st).unwrap();
     assert!(s.newest(now_ns()).frame.is_some());
     p.loan().unwrap().send(&st).unwrap();
-    assert_eq!(s.newest(now_ns()).last_reject, Some(Reject::Order));
+    assert_eq!(s.newest(now_ns()).last_error, Some(FrameError::Order));
     // After all that a good frame is still a good frame.
     send(&mut p, 3);
     assert!(s.newest(now_ns()).frame.is_some());
@@ -169,7 +169,7 @@ fn a_second_publisher_is_refused_while_the_first_lives_and_accepted_after() {
     assert_eq!(s.newest(now_ns()).source, Some(SourceEvent::First));
     send(&mut two, 2);
     let got = s.newest(now_ns());
-    assert_eq!((got.source, got.last_reject), (Some(SourceEvent::SecondPublisher), Some(Reject::Foreign)));
+    assert_eq!((got.source, got.last_error), (Some(SourceEvent::SecondPublisher), Some(FrameError::Foreign)));
     assert!(got.frame.is_none());
     send(&mut one, 3);
     assert_eq!(s.newest(now_ns()).frame.unwrap().bytes(0)[0], 3);

@@ -1,47 +1,14 @@
 //! Forward kinematics by a Denavit-Hartenberg table, nominal or a unit's own.
 
-use super::{Joints, Model};
+use super::{Dh, Joints, Model};
 use crate::geom::{Pose, Vec3};
 use crate::math;
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
-
-/// Denavit-Hartenberg table, standard convention: frame i follows frame i-1 by a turn of `q + theta` about z, `d` along z, `a`
-/// along the new x and a turn of `alpha` about it.
-///
-/// The base frame is UR's own (the pendant's "Base"), without the half turn of the URDF's `base_link`. A calibrated unit has
-/// small offsets in all of the columns; `d` of joints 2 and 3 may be large and opposite in it, which is meant so.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Dh {
-    /// Link lengths, metres.
-    pub a: [f64; 6],
-    /// Link offsets, metres.
-    pub d: [f64; 6],
-    /// Link twists, rad.
-    pub alpha: [f64; 6],
-    /// Offsets added to the joint angles, rad.
-    pub theta: [f64; 6],
-}
 
 impl Dh {
     /// The table of a model as designed.
     pub const fn nominal(model: Model) -> Self {
         model.dh()
-    }
-
-    /// This table with another added entry by entry: nominal plus a unit's calibration deltas.
-    pub fn plus(&self, delta: &Dh) -> Self {
-        let add = |x: &[f64; 6], y: &[f64; 6]| core::array::from_fn(|i| x[i] + y[i]);
-        Self {
-            a: add(&self.a, &delta.a),
-            d: add(&self.d, &delta.d),
-            alpha: add(&self.alpha, &delta.alpha),
-            theta: add(&self.theta, &delta.theta),
-        }
-    }
-
-    /// Whether every entry is a finite number.
-    pub fn is_finite(&self) -> bool {
-        [&self.a, &self.d, &self.alpha, &self.theta].into_iter().flatten().all(|v| v.is_finite())
     }
 
     /// Frame i in frame i-1 for joint `i` (0 to 5) at angle `q`.

@@ -49,7 +49,7 @@ fn goal_points(c: &CycleConfig, goal: &Goal, best: View) -> Result<u8, Reject> {
 /// Whether the way from `pose` (gripper in the rig now, joints `q`) over pre-grasp to grasp can be gone.
 ///
 /// Only relative motion enters: the goal relative to where the gripper is. Work is bounded: 16 poses, each a few Newton steps.
-pub(super) fn way(c: &CycleConfig, limits: &Limits, pose: &Pose, q: &Joints, s: &SetPoint) -> Result<(), Reject> {
+pub(super) fn path(c: &CycleConfig, limits: &Limits, pose: &Pose, q: &Joints, s: &SetPoint) -> Result<(), Reject> {
     let mount = &c.gripper.flange_from_gripper;
     let base_from_left = c.dh.base_from_gripper(q, mount) * pose.inverse();
     let unmount = mount.inverse();

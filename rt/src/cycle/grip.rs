@@ -55,7 +55,7 @@ impl Fingers {
     }
 
     /// The controller's outputs, as numbered by the script.
-    pub(super) fn see(&mut self, task: &TaskSettings, levels: u32, now_ns: u64) {
+    pub(super) fn observe(&mut self, task: &TaskSettings, levels: u32, now_ns: u64) {
         if self.told.is_none_or(|(_, until)| now_ns >= until) {
             self.grip = task.grip(levels);
         }
@@ -142,17 +142,17 @@ mod tests {
     fn what_nobody_has_seen_may_hold_and_a_command_is_believed_until_it_can_show() {
         let mut f = Fingers::new(&BOTH);
         assert!(f.may_hold(), "nothing seen yet");
-        f.see(&BOTH, 0x200, 5);
+        f.observe(&BOTH, 0x200, 5);
         assert!(!f.may_hold());
         f.tell(true, 10);
-        f.see(&BOTH, 0x200, 10 + SETTLE_NS - 1);
+        f.observe(&BOTH, 0x200, 10 + SETTLE_NS - 1);
         assert!(f.may_hold(), "the outputs are still on their way");
-        f.see(&BOTH, 0x200, 10 + SETTLE_NS);
+        f.observe(&BOTH, 0x200, 10 + SETTLE_NS);
         assert!(!f.may_hold(), "they never changed: it is open");
         let mut f = Fingers::new(&task(0, 0));
         assert!(!f.may_hold());
         f.tell(true, 0);
-        f.see(&task(0, 0), 0, u64::MAX);
+        f.observe(&task(0, 0), 0, u64::MAX);
         assert!(f.may_hold() && f.grip() == Grip::None);
     }
 

@@ -54,7 +54,7 @@ pub enum RequestKind {
 
 /// A request with the number that its answer carries.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Request {
+pub struct CommandRequest {
     /// Chosen by who asks.
     pub id: u64,
     /// What for.
@@ -82,7 +82,7 @@ pub struct CommandInput<'a> {
     /// The newest vision result since the last cycle, if there is one.
     pub vision: Option<&'a Vision>,
     /// At most one request; a stop goes before all others.
-    pub request: Option<Request>,
+    pub request: Option<CommandRequest>,
     /// A set-point offered by the operator.
     pub setpoint: Option<&'a SetPoint>,
     /// A thread of the daemon ended or a defect was caught: stop.

@@ -89,7 +89,7 @@ impl CommandCycle {
         }
         if self.work.moving {
             let needed = self.config.settings.converge.frames;
-            let done = self.motion.as_ref().is_some_and(|m| m.reference.ended()) && self.steady >= needed;
+            let done = self.motion.as_ref().is_some_and(|m| m.reference.ended()) && self.convergence.steady() >= needed;
             if !done {
                 return;
             }
@@ -109,7 +109,7 @@ impl CommandCycle {
             Some(leg) => {
                 self.motion = Some(leg);
                 self.work.moving = true;
-                self.fresh_leg(now);
+                self.start_leg(now);
             }
             None => self.work.clear(),
         }

@@ -1,8 +1,12 @@
 //! The modes of the loop, and the one table that leads from one to another.
 
 mod fault;
+mod hold;
+mod reject;
 
-pub use fault::{FaultCause, HoldCause, Reject};
+pub use fault::FaultCause;
+pub use hold::HoldCause;
+pub use reject::Reject;
 
 /// A mode.
 ///

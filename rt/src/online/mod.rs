@@ -6,6 +6,7 @@ mod frame;
 pub mod interaction;
 mod likelihood;
 pub mod marks;
+mod observation;
 pub mod path;
 pub mod pose;
 pub mod predict;
@@ -17,5 +18,6 @@ mod vision;
 mod vision_cycle;
 
 pub use frame::{FrameFaults, FrameLimits, FrameReject, StereoFrame};
-pub use vision::{MarkObservation, Vision, VisionStatus};
+pub use observation::{MarkObservation, RigHealth};
+pub use vision::{Vision, VisionStatus};
 pub use vision_cycle::{VisionCycle, VisionHealth, VisionSettings};

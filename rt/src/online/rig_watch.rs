@@ -12,6 +12,7 @@
 //! images cannot disagree about a motion: a camera that was moved is still moved then, a disturbance is over.
 
 use super::likelihood::{STEP, free_pose, gain, scaled, scaled_score, scaled_vector, set_cross, solve, start};
+pub use super::observation::RigHealth;
 use super::pose::MarkTable;
 use super::rig_fit::{Evidence, Joint, JointVector, RigMatrix};
 use crate::geom::{Pose, RIG_UNKNOWNS, Rig, RigError, RigOffset, Twist, adjoint, exp_twist, log_pose};
@@ -57,24 +58,6 @@ impl Default for RigWatchSettings {
             decide: 12,
         }
     }
-}
-
-/// The rig as the marks show it.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct RigHealth {
-    /// How far off the rig seems, in deviations of its stated error (root of the sum of squares over its unknowns).
-    pub offset_sigmas: f64,
-    /// Encoders and images disagree as if a camera had moved; at rest it will be known.
-    pub suspicious: bool,
-    /// How many times a camera was found moved since the start. A plan is good for one such number.
-    pub moves: u32,
-    /// How many smaller changes were noticed, which lead the gripper astray by less than matters.
-    pub shakes: u32,
-    /// How far the last of either leads the gripper astray, metres (unit-scaled).
-    pub astray_m: f64,
-    /// Evidence of a change: of one step in this frame, and of the window against the start, as shares of what is
-    /// significant.
-    pub evidence: [f64; 2],
 }
 
 /// Frames after a start before a step can be told: the offset is being learnt.

@@ -1,20 +1,9 @@
 //! What the vision thread tells the command thread about one stereo pair.
 
-use super::rig_watch::RigHealth;
-use crate::geom::{Pixel, Pose};
+use super::observation::{MarkObservation, RigHealth};
+use crate::geom::Pose;
 use crate::gripper::MAX_MARKS;
-use nalgebra::{Matrix2, Matrix6};
-
-/// One mark seen in one view.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct MarkObservation {
-    /// Image of the disc's centre, pixels with lens distortion; the perspective bias of the disc's centroid is already removed.
-    pub pixel: Pixel,
-    /// Covariance of `pixel`, px².
-    pub covariance: Matrix2<f64>,
-    /// 0 (barely a mark) to 1 (all of the disc seen, good contrast).
-    pub quality: f32,
-}
+use nalgebra::Matrix6;
 
 /// How much a [`Vision`] may be trusted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

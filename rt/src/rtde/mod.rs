@@ -6,7 +6,7 @@
 //! 2. [`ClientMessage`] and [`ControllerMessage`] are the meanings of packages in both directions and both protocol
 //!    [`Version`]s; `parse` borrows, `emit` writes into a caller's buffer.
 //! 3. [`Field`] knows every variable of the protocol by name and type; a [`Recipe`] is an ordered choice of them, and a
-//!    [`Slot`] the resolved place of one value.
+//!    [`FieldSlot`] the resolved place of one value.
 //! 4. [`Session`] is the client's half of the conversation: what to send next, and what an answer means.
 //! 5. [`StateReader`] and [`CommandWriter`] are graspd's own recipes; [`GapMeter`] counts what the controller left out,
 //!    and [`PhaseLock`] lets a cycle follow the controller's.
@@ -44,7 +44,7 @@ pub use message::{
     ClientMessage, ControllerMessage, ControllerVersion, Kind, Level, MessageError, NoRoom, Text, Version,
 };
 pub use phase::PhaseLock;
-pub use recipe::{Answer, Entry, Recipe, RecipeError, Slot, answers, join, names};
+pub use recipe::{Answer, Entry, FieldSlot, Recipe, RecipeError, answers, join, names};
 pub use robot::{
     COMMAND_FIELDS, ClockStep, CommandWriter, GapMeter, NEEDED_FIELDS, SCRIPT_VERSION, STATE_FIELDS, StateReader,
     script_state,

@@ -127,7 +127,7 @@ pub struct Entry {
 
 /// Resolved fields in package order, at most `N`.
 ///
-/// Every read and write of a [`Slot`] is checked against the bytes given, so a package that is shorter than the recipe gives
+/// Every read and write of a [`FieldSlot`] is checked against the bytes given, so a package that is shorter than the recipe gives
 /// `None`, never a wrong value.
 ///
 /// ```
@@ -195,14 +195,14 @@ impl<const N: usize> Recipe<N> {
 
     /// Where the variable of this name is; `None` if it is not in the recipe, or is not of type `T`. Of a variable that
     /// stands in the recipe twice, the first.
-    pub fn slot<T: Wire>(&self, name: &str) -> Option<Slot<T>> {
+    pub fn slot<T: Wire>(&self, name: &str) -> Option<FieldSlot<T>> {
         let first = self.entries.first()?;
         let field = Field::find(first.field.side(), name)?;
         if field.kind() != T::KIND {
             return None;
         }
         let entry = self.entries.iter().find(|e| e.field == field)?;
-        Some(Slot { offset: entry.offset, kind: PhantomData })
+        Some(FieldSlot { offset: entry.offset, kind: PhantomData })
     }
 
     /// The values of a package one by one, untyped; stops where the bytes end.
@@ -215,12 +215,12 @@ impl<const N: usize> Recipe<N> {
 
 /// The place of a value of type `T` among the values of a data package: resolve once, read each cycle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Slot<T> {
+pub struct FieldSlot<T> {
     offset: u16,
     kind: PhantomData<T>,
 }
 
-impl<T: Wire> Slot<T> {
+impl<T: Wire> FieldSlot<T> {
     /// The value; `None` when the bytes end before it.
     #[inline]
     pub fn read(&self, values: &[u8]) -> Option<T> {

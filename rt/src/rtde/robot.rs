@@ -1,7 +1,7 @@
 //! The recipes that graspd itself uses: robot state in, set-points for its control script out (docs/RTDE-REGISTERS.md).
 
 use super::message::{Kind, NoRoom, package};
-use super::recipe::{Recipe, Slot};
+use super::recipe::{FieldSlot, Recipe};
 use super::value::Wire;
 use crate::arm::{ArmCommand, ArmMode, Joints, RobotState, ToolPoint};
 
@@ -79,14 +79,14 @@ pub mod script_state {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StateReader {
     size: usize,
-    timestamp: Slot<f64>,
-    vectors: [Slot<Joints>; 4],
-    robot_mode: Slot<i32>,
-    words: [Slot<u32>; 3],
-    scales: [Slot<f64>; 2],
-    digital: Slot<u64>,
-    script: [Slot<i32>; 5],
-    tool: Option<[Slot<Joints>; 2]>,
+    timestamp: FieldSlot<f64>,
+    vectors: [FieldSlot<Joints>; 4],
+    robot_mode: FieldSlot<i32>,
+    words: [FieldSlot<u32>; 3],
+    scales: [FieldSlot<f64>; 2],
+    digital: FieldSlot<u64>,
+    script: [FieldSlot<i32>; 5],
+    tool: Option<[FieldSlot<Joints>; 2]>,
 }
 
 impl StateReader {

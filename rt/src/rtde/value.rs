@@ -178,7 +178,7 @@ mod sealed {
     pub trait Sealed {}
 }
 
-/// A Rust type that stands for one RTDE type: what a typed [`Slot`](super::Slot) reads and writes.
+/// A Rust type that stands for one RTDE type: what a typed [`FieldSlot`](super::FieldSlot) reads and writes.
 pub trait Wire: Copy + sealed::Sealed {
     /// The RTDE type.
     const KIND: FieldType;

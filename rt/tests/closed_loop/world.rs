@@ -3,7 +3,7 @@
 
 use graspd_rt::arm::{ArmCommand, ArmMode, Dh, Joints, Model, READY, RobotState, ToolPoint};
 use graspd_rt::cycle::{
-    CommandCycle, CommandInput, CommandOutput, CycleConfig, CycleSettings, LinkStatus, Request, RequestKind,
+    CommandCycle, CommandInput, CommandOutput, CommandRequest, CycleConfig, CycleSettings, LinkStatus, RequestKind,
 };
 use graspd_rt::geom::{Camera, Distortion, Pixel, Pose, Rig, Twist, Vec3, View, exp_twist, log_pose};
 use graspd_rt::gripper::{Gripper, MAX_MARKS, Mark};
@@ -472,7 +472,7 @@ impl World {
                 states_missing: self.states[1],
             },
             vision: vision.as_ref(),
-            request: request.map(|kind| Request { id: 1, kind }),
+            request: request.map(|kind| CommandRequest { id: 1, kind }),
             setpoint: offer.then_some(&self.setpoint),
             internal_fault: self.faults.internal,
         });

@@ -8,9 +8,9 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-/// Samples a slow reader may fall behind before it misses some.
+/// Samples that a slow reader may fall behind before it misses some.
 const BUFFER: usize = 8;
-/// Readers at once: console, recorder, metrics, command line tools.
+/// Largest number of readers: console, recorder, metrics, command line tools.
 const SUBSCRIBERS: usize = 16;
 
 fn open(node: &ShmNode) -> Result<PortFactory<ipc::Service, TelemetrySample, ()>, ControlError> {
@@ -29,7 +29,7 @@ fn open(node: &ShmNode) -> Result<PortFactory<ipc::Service, TelemetrySample, ()>
         .map_err(|e| ControlError::open(&name, &e))
 }
 
-/// Publishes telemetry. Sending allocates inside iceoryx2: never from a real-time thread.
+/// Publishes telemetry. iceoryx2 allocates when it sends: never publish from a real-time thread.
 #[derive(Debug)]
 pub struct TelemetryPublisher {
     publisher: Publisher<ipc::Service, TelemetrySample, ()>,
@@ -40,7 +40,7 @@ impl TelemetryPublisher {
     /// Opens or creates the topic.
     ///
     /// # Errors
-    /// When the topic exists with another layout, or shared memory is refused.
+    /// The topic exists with another layout, or the shared memory cannot be used.
     pub fn new(node: &ShmNode) -> Result<Self, ControlError> {
         let service = open(node)?;
         let publisher = service.publisher_builder().create().map_err(|e| ControlError::open("telemetry", &e))?;
@@ -50,7 +50,7 @@ impl TelemetryPublisher {
     /// Publishes one sample.
     ///
     /// # Errors
-    /// When shared memory fails underneath; the next call may succeed.
+    /// iceoryx2 cannot send; the next call may succeed.
     pub fn publish(&self, sample: &TelemetrySample) -> Result<(), ControlError> {
         let loan = self.publisher.loan_uninit().map_err(|e| ControlError::io("telemetry", &e))?;
         loan.write_payload(*sample).send().map_err(|e| ControlError::io("telemetry", &e))?;
@@ -69,17 +69,17 @@ impl TelemetrySubscriber {
     /// Opens or creates the topic.
     ///
     /// # Errors
-    /// When the topic exists with another layout, or shared memory is refused.
+    /// The topic exists with another layout, or the shared memory cannot be used.
     pub fn new(node: &ShmNode) -> Result<Self, ControlError> {
         let service = open(node)?;
         let subscriber = service.subscriber_builder().create().map_err(|e| ControlError::open("telemetry", &e))?;
         Ok(Self { subscriber, _service: service })
     }
 
-    /// The oldest unread sample, if there is one. Samples of another layout version are an error, never trusted.
+    /// The oldest unread sample, if there is one.
     ///
     /// # Errors
-    /// When shared memory fails, or the publisher speaks another version.
+    /// iceoryx2 cannot receive, or the sample has another layout version.
     pub fn next(&self) -> Result<Option<TelemetrySample>, ControlError> {
         let Some(sample) = self.subscriber.receive().map_err(|e| ControlError::io("telemetry", &e))? else {
             return Ok(None);
