@@ -8,8 +8,14 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
+/// Samples that a new reader gets from before it joined.
+const HISTORY: usize = 1;
 /// Samples that a slow reader may fall behind before it misses some.
 const BUFFER: usize = 8;
+/// Samples that a reader may hold.
+const BORROWED: usize = 2;
+/// One daemon, and its successor.
+const PUBLISHERS: usize = 2;
 /// Largest number of readers: console, recorder, metrics, command line tools.
 const SUBSCRIBERS: usize = 16;
 
@@ -19,10 +25,10 @@ fn open(node: &ShmNode) -> Result<PortFactory<ipc::Service, TelemetrySample, ()>
     node.node()
         .service_builder(&parsed)
         .publish_subscribe::<TelemetrySample>()
-        .history_size(1)
+        .history_size(HISTORY)
         .subscriber_max_buffer_size(BUFFER)
-        .subscriber_max_borrowed_samples(2)
-        .max_publishers(2)
+        .subscriber_max_borrowed_samples(BORROWED)
+        .max_publishers(PUBLISHERS)
         .max_subscribers(SUBSCRIBERS)
         .enable_safe_overflow(true)
         .open_or_create()
@@ -92,5 +98,20 @@ impl TelemetrySubscriber {
             });
         }
         Ok(Some(*sample))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn control_md_documents_the_quality_of_service() {
+        for row in [
+            format!("| history / subscriber buffer / borrowed | {HISTORY} / {BUFFER} / {BORROWED} |"),
+            format!("| publishers / subscribers | {PUBLISHERS} / {SUBSCRIBERS} ("),
+        ] {
+            assert!(include_str!("../../CONTROL.md").contains(&row), "{row}");
+        }
     }
 }

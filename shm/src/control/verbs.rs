@@ -12,6 +12,15 @@ use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::request_response::PortFactory;
 use std::time::{Duration, Instant};
 
+/// One daemon.
+const SERVERS: usize = 1;
+/// Consoles and command line tools.
+const CLIENTS: usize = 16;
+/// A client sends the next request after the answer to the last one.
+const ACTIVE_REQUESTS: usize = 1;
+/// Answers that wait for a client.
+const RESPONSES: usize = 2;
+
 type Factory = PortFactory<ipc::Service, [u8], RequestHeader, [u8], AnswerHeader>;
 
 /// An error of telemetry or requests.
@@ -77,10 +86,10 @@ fn open(node: &ShmNode) -> Result<Factory, ControlError> {
         .request_response::<[u8], [u8]>()
         .request_user_header::<RequestHeader>()
         .response_user_header::<AnswerHeader>()
-        .max_servers(1)
-        .max_clients(16)
-        .max_active_requests_per_client(1)
-        .max_response_buffer_size(2)
+        .max_servers(SERVERS)
+        .max_clients(CLIENTS)
+        .max_active_requests_per_client(ACTIVE_REQUESTS)
+        .max_response_buffer_size(RESPONSES)
         .open_or_create()
         .map_err(|e| ControlError::open(&name, &e))
 }
@@ -245,5 +254,17 @@ impl RequestServer {
             }
         }
         Ok(None)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn control_md_documents_the_quality_of_service() {
+        let document = include_str!("../../CONTROL.md").replace('\n', " ");
+        let text = format!("{CLIENTS} clients, one active request per client, a response buffer of {RESPONSES}");
+        assert!(document.contains(&text) && document.contains("One server") && (SERVERS, ACTIVE_REQUESTS) == (1, 1));
     }
 }
