@@ -53,7 +53,7 @@ impl CommandCycle {
         if self.fingers.may_hold() {
             return Err(Reject::GripperClosed);
         }
-        if self.arm.thin().is_some() {
+        if self.arm.states_missing().is_some() {
             return Err(Reject::StatesMissing);
         }
         if self.vision.rig().is_some_and(|r| r.suspicious) {

@@ -49,7 +49,7 @@ impl CommandCycle {
         if limit > 0 && missed > limit {
             return Some(HoldCause::Overruns { count: missed });
         }
-        if let Some(share) = self.arm.thin() {
+        if let Some(share) = self.arm.states_missing() {
             return Some(HoldCause::StatesMissing { share });
         }
         if self.arm.slider() < MIN_SLIDER {

@@ -1,8 +1,8 @@
-//! What stops the loop, with its evidence and a stable code.
+//! Causes that stop the loop and latch, with their evidence and stable codes.
 
 use core::fmt;
 
-/// Why the loop stopped and latched: each needs its cause gone and an operator's reset.
+/// Why the loop stopped and latched. To clear it, the cause must be gone and an operator must reset.
 ///
 /// The codes are stable: logs, console and manual use them.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -11,43 +11,43 @@ pub enum FaultCause {
     FramesStale {
         /// Age of the newest result's image, ns.
         age_ns: u64,
-        /// Greatest allowed age, ns.
+        /// Largest allowed age, ns.
         limit_ns: u64,
     },
-    /// F-CAM-02: stamps from the future, or far in the past.
+    /// F-CAM-02: capture stamps in the future or far in the past.
     FrameStamps {
-        /// Results refused in a row.
+        /// Consecutive refused results.
         count: u32,
     },
-    /// F-MRK-01: the marks jumped further than the arm can move.
+    /// F-MRK-01: the marks jumped farther than the arm can move.
     MarksJumped {
         /// Length of the jump, metres (unit-scaled).
         jump_m: f64,
-        /// Greatest possible, metres.
+        /// Largest possible motion, metres (unit-scaled).
         limit_m: f64,
     },
-    /// F-CAM-03: a camera was moved since the set-point was given: what was planned is no longer where the images say.
+    /// F-CAM-03: a camera was moved after the set-point was given, so that the plan no longer fits the images.
     CameraMoved {
-        /// How far that leads the gripper astray, metres (unit-scaled).
+        /// Error of the gripper's position that this would cause, metres (unit-scaled).
         astray_m: f64,
     },
-    /// F-MRK-02: the images and the joints disagree about the motion (frozen image, wrong camera, slipping mount).
+    /// F-MRK-02: images and joints disagree about the motion (frozen image, wrong camera, loose mounting).
     MotionMismatch {
         /// Motion by the joints over the window, metres (unit-scaled).
         joints_m: f64,
         /// Disagreement, metres (unit-scaled).
         difference_m: f64,
     },
-    /// F-LAW-01: the gripper does not go where it is sent: a sign, frame or mounting is wrong.
+    /// F-LAW-01: the gripper does not move as commanded: a sign, a frame or the mounting is wrong.
     WrongWay {
-        /// Share of the intended motion that was seen; 1 is right, -1 the opposite.
+        /// Fraction of the intended motion that was seen: 1 is right, -1 is the opposite direction.
         agreement: f64,
         /// Motion since the start, metres (unit-scaled).
         moved_m: f64,
     },
-    /// F-LAW-02: the law's own numbers are not finite, or were far above its caps for long.
+    /// F-LAW-02: the law's rates are not finite or above a compiled ceiling: a defect of the program.
     LawBroken {
-        /// Cycles with such numbers in the last second.
+        /// Cycles with such rates since the last reset.
         cycles: u32,
     },
     /// F-ARM-01: the link to the robot is lost.
@@ -56,17 +56,17 @@ pub enum FaultCause {
     StateStale {
         /// Age, ns.
         age_ns: u64,
-        /// Greatest allowed age, ns.
+        /// Largest allowed age, ns.
         limit_ns: u64,
     },
-    /// F-ARM-03: our set-points do not arrive: the heartbeat echoed by the control script stopped.
+    /// F-ARM-03: set-points do not arrive: the heartbeat that the control script echoes has stopped.
     EchoStopped {
-        /// How long, ns.
+        /// For how long, ns.
         for_ns: u64,
     },
     /// F-ARM-04: set-points cannot be sent.
     SendBlocked {
-        /// Attempts in a row.
+        /// Consecutive failed attempts.
         count: u32,
     },
     /// F-ARM-05: protective stop.
@@ -90,16 +90,16 @@ pub enum FaultCause {
         /// `runtime_state`.
         runtime_state: u32,
     },
-    /// F-ARM-11: the control script reported a fault of its own.
+    /// F-ARM-11: the control script reports a fault.
     ScriptFault {
-        /// Its fault word.
+        /// Its number (docs/RTDE-REGISTERS.md).
         word: i32,
     },
     /// F-ARM-12: another program commands the robot.
     TokenChanged {
-        /// Our session's token.
+        /// Token of this session.
         expected: i32,
-        /// What was echoed.
+        /// Token that was echoed.
         found: i32,
     },
     /// F-ARM-13: the controller's clock went back: it restarted.
@@ -116,30 +116,31 @@ pub enum FaultCause {
         /// Its position error, rad.
         position: f64,
     },
-    /// F-ARM-15: the arm moves without being told to.
+    /// F-ARM-15: the arm moves without a command.
     Uncommanded {
         /// The fastest joint, 0 to 5.
         joint: u8,
         /// Its velocity, rad/s.
         velocity: f64,
     },
-    /// F-ARM-16: a robot value is not a number, out of range, or jumped.
+    /// F-ARM-16: a value of the robot state is NaN, out of range, or jumped.
     StateAbsurd {
-        /// The joint, 0 to 5; 6 where it is no joint's value.
+        /// The joint, 0 to 5; 6 for a value that belongs to no joint.
         joint: u8,
         /// The value.
         value: f64,
     },
-    /// F-ARM-17: the controller's own speed of its tool point is another than ours: our kinematics are not this arm's.
+    /// F-ARM-17: the controller's speed of its tool point differs from the one computed here: the configured kinematics are not
+    /// those of this arm.
     ToolSpeed {
         /// By the controller, m/s.
         controller_m_per_s: f64,
-        /// By our kinematics, m/s.
+        /// By the configured kinematics, m/s.
         ours_m_per_s: f64,
     },
-    /// F-TIM-01: the loop was not run for too long.
+    /// F-TIM-01: the loop did not run for too long.
     Stalled {
-        /// How long, ns.
+        /// For how long, ns.
         for_ns: u64,
     },
     /// F-TIM-02: time went backwards.
@@ -183,22 +184,22 @@ impl FaultCause {
     }
 }
 
-/// The control script's fault words (docs/RTDE-REGISTERS.md).
+/// Text of a fault number of the control script (docs/RTDE-REGISTERS.md).
 const fn script_fault(word: i32) -> &'static str {
     match word {
-        1 => "a joint rate is not a number or above its limit",
-        2 => "the acceleration is not a number or out of range",
-        3 => "unknown mode word",
-        4 => "it heard no new set-point in time: check the network",
-        5 => "somebody else writes its registers",
-        6 => "the outputs word means nothing",
-        7 => "a joint target is not a number or too far away",
-        8 => "nobody shook hands in time",
-        _ => "a fault that this version does not know",
+        1 => "a joint rate is NaN or above its limit",
+        2 => "the acceleration is NaN or out of range",
+        3 => "unknown mode number",
+        4 => "it received no new set-point in time: check the network",
+        5 => "another program writes its registers",
+        6 => "the output bits are not valid",
+        7 => "a joint target is NaN or too far away",
+        8 => "no handshake came in time",
+        _ => "a fault number that this version does not know",
     }
 }
 
-/// In words, with the figures, and what to do. Formatting happens outside the loop.
+/// Text with the figures and what to do. It is formatted outside the loop.
 impl fmt::Display for FaultCause {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let ms = |ns: &u64| *ns as f64 * 1e-6;
@@ -210,73 +211,104 @@ impl fmt::Display for FaultCause {
                 ms(limit_ns)
             ),
             FaultCause::FrameStamps { count } => {
-                write!(f, "{count} images in a row with impossible time stamps: check the camera driver's clock")
+                write!(f, "{count} consecutive images have impossible time stamps: check the camera driver's clock")
             }
             FaultCause::CameraMoved { astray_m } => write!(
                 f,
-                "a camera was moved since the set-point was given, which would lead the gripper {:.1} mm astray: fix the camera, check the calibration, take new images and plan again",
+                "a camera was moved after the set-point was given, which puts the gripper {:.1} mm off its goal: fix the camera, check \
+                 the calibration, take new images and plan again",
                 astray_m * 1e3
             ),
             FaultCause::MarksJumped { jump_m, limit_m } => write!(
                 f,
-                "the marks jumped by {:.1} mm, more than the arm can move ({:.1} mm)",
+                "the marks jumped by {:.1} mm, more than the arm can move ({:.1} mm): check for reflections and for other marks in view",
                 jump_m * 1e3,
                 limit_m * 1e3
             ),
             FaultCause::MotionMismatch { joints_m, difference_m } => write!(
                 f,
-                "the arm moved by {:.1} mm and the images disagree by {:.1} mm: an image stands still, or the gripper's mounting is wrong",
+                "the arm moved by {:.1} mm and the images disagree by {:.1} mm: check for a frozen image and check the gripper's mounting \
+                 (flange_from_gripper)",
                 joints_m * 1e3,
                 difference_m * 1e3
             ),
             FaultCause::WrongWay { agreement, moved_m } => write!(
                 f,
-                "the gripper does not go where it is sent (agreement {agreement:.2} after {:.1} mm): check flange_from_gripper, the arm's model and the marks",
+                "the gripper does not move as commanded (agreement {agreement:.2} after {:.1} mm): check flange_from_gripper, the arm's \
+                 model and the marks",
                 moved_m * 1e3
             ),
             FaultCause::LawBroken { cycles } => {
-                write!(f, "the law gave unusable numbers in {cycles} cycles of one second")
+                write!(
+                    f,
+                    "the law computed unusable rates in {cycles} cycles: a defect of the program, please report it"
+                )
             }
-            FaultCause::LinkLost => write!(f, "the link to the robot is lost"),
+            FaultCause::LinkLost => write!(f, "the link to the robot is lost: check the network and the controller"),
             FaultCause::StateStale { age_ns, limit_ns } => {
                 write!(f, "robot state is {:.1} ms old (limit {:.1} ms): check the network", ms(age_ns), ms(limit_ns))
             }
             FaultCause::EchoStopped { for_ns } => {
-                write!(f, "the control script has not seen a new set-point for {:.0} ms", ms(for_ns))
+                write!(
+                    f,
+                    "the control script has not received a new set-point for {:.0} ms: check the network",
+                    ms(for_ns)
+                )
             }
-            FaultCause::SendBlocked { count } => write!(f, "{count} set-points in a row could not be sent"),
-            FaultCause::ProtectiveStop => write!(f, "protective stop: look at the pendant, then recover"),
-            FaultCause::EmergencyStop => write!(f, "emergency stop: release it on purpose, then recover"),
+            FaultCause::SendBlocked { count } => write!(
+                f,
+                "{count} consecutive set-points could not be sent: check the network and the controller's load"
+            ),
+            FaultCause::ProtectiveStop => write!(f, "protective stop: read the pendant's message, then recover"),
+            FaultCause::EmergencyStop => {
+                write!(f, "emergency stop: make sure that it is safe, release it, then recover")
+            }
             FaultCause::SafeguardStop => write!(f, "safeguard stop: clear the safeguard, then recover"),
-            FaultCause::SafetyFault { bits } => write!(f, "the controller reports a safety fault (bits {bits:#x})"),
-            FaultCause::NotRunning { mode } => write!(f, "the robot left mode running (robot_mode {mode})"),
+            FaultCause::SafetyFault { bits } => {
+                write!(f, "the controller reports a safety fault (bits {bits:#x}): read the pendant's message")
+            }
+            FaultCause::NotRunning { mode } => {
+                write!(f, "the robot is not in mode running (robot_mode {mode}): power on and release the brakes")
+            }
             FaultCause::ProgramStopped { runtime_state } => {
-                write!(f, "the control script was stopped or paused (runtime_state {runtime_state})")
+                write!(f, "the control script was stopped or paused (runtime_state {runtime_state}): check the pendant")
             }
             FaultCause::ScriptFault { word } => {
                 write!(f, "the control script reports fault {word}: {}", script_fault(*word))
             }
             FaultCause::TokenChanged { expected, found } => {
-                write!(f, "another program commands the robot (token {found}, ours is {expected})")
+                write!(f, "another program commands the robot (token {found}, expected {expected}): stop it")
             }
             FaultCause::ClockBack { by_s } => {
                 write!(f, "the controller's clock went back by {by_s:.3} s: it restarted")
             }
             FaultCause::TrackingError { joint, velocity, position } => {
-                write!(f, "joint {joint} does not follow: {velocity:.3} rad/s, {position:.3} rad off its set-points")
+                write!(
+                    f,
+                    "joint {joint} does not follow its set-points: off by {velocity:.3} rad/s and {position:.3} rad; check for contact and payload"
+                )
             }
             FaultCause::Uncommanded { joint, velocity } => {
-                write!(f, "joint {joint} moves at {velocity:.3} rad/s without being told to")
+                write!(
+                    f,
+                    "joint {joint} moves at {velocity:.3} rad/s without a command: check for another program and for freedrive"
+                )
             }
-            FaultCause::StateAbsurd { joint, value } => write!(f, "robot value of joint {joint} is absurd: {value}"),
+            FaultCause::StateAbsurd { joint, value } => {
+                write!(f, "the robot state is not plausible: value {value} of joint {joint} (6: of none)")
+            }
             FaultCause::ToolSpeed { controller_m_per_s, ours_m_per_s } => write!(
                 f,
-                "the controller says that its TCP moves at {controller_m_per_s:.3} m/s, by our kinematics it is {ours_m_per_s:.3} m/s: \
-                 arm.kinematics is not this arm's"
+                "the controller reports {controller_m_per_s:.3} m/s for its TCP, the configured kinematics give {ours_m_per_s:.3} m/s: \
+                 arm.kinematics is not that of this arm"
             ),
-            FaultCause::Stalled { for_ns } => write!(f, "the loop stood still for {:.1} ms", ms(for_ns)),
-            FaultCause::TimeBack => write!(f, "the monotonic clock went back"),
-            FaultCause::Internal => write!(f, "a defect was caught inside the daemon; see the log"),
+            FaultCause::Stalled { for_ns } => write!(
+                f,
+                "the loop did not run for {:.1} ms: check the host's load and the real-time settings",
+                ms(for_ns)
+            ),
+            FaultCause::TimeBack => write!(f, "the monotonic clock went back: check the host"),
+            FaultCause::Internal => write!(f, "a defect inside the daemon was caught: see the log"),
         }
     }
 }
@@ -286,7 +318,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn codes_are_all_different() {
+    fn codes_are_unique() {
         let faults = [
             FaultCause::FramesStale { age_ns: 0, limit_ns: 0 },
             FaultCause::FrameStamps { count: 0 },
