@@ -49,8 +49,8 @@ impl<'a> ImageView<'a> {
 
     /// Grey values along a straight line by bilinear interpolation: `out[i]` at `(x + i dx, y + i dy)`, pixels.
     ///
-    /// `false`, with `out` undefined, unless all four neighbours of every sample are inside (NaN is outside). Positions are
-    /// rounded to 2^-16 px, which avoids a conversion from float to integer in the inner loop.
+    /// `false`, with `out` undefined, unless all four neighbours of every sample are inside (NaN is outside). Positions
+    /// are rounded to 2^-16 px, which avoids a conversion from float to integer in the inner loop.
     pub fn profile(&self, x: f64, y: f64, dx: f64, dy: f64, out: &mut [f64]) -> bool {
         const ONE: f64 = 65_536.0;
         // Rounding down may lower a position by one unit; it must not fall below zero.

@@ -1,4 +1,5 @@
-//! The set-point, the only value that the off-line stage passes to the on-line stage: the pixels of the marks at the goal.
+//! The set-point, the only value that the off-line stage passes to the on-line stage: the pixels of the marks at the
+//! goal.
 
 use crate::geom::{Pixel, Pose, Vec3};
 use crate::gripper::MAX_MARKS;
@@ -8,7 +9,8 @@ use crate::gripper::MAX_MARKS;
 pub struct Goal {
     /// Gripper pose in the rig at the goal. It gives depths and path; the loop is closed on `marks`.
     pub left_from_gripper: Pose,
-    /// Predicted pixel of each mark's centre by view and mark index, with lens distortion; `None` where it would not be seen.
+    /// Predicted pixel of each mark's centre by view and mark index, with lens distortion; `None` where it would not be
+    /// seen.
     pub marks: [[Option<Pixel>; MAX_MARKS]; 2],
 }
 

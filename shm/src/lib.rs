@@ -6,13 +6,13 @@
 //! |---|---|---|
 //! | [`names`] | root folder, prefix and cell: where processes meet | `LAYOUT.md` |
 //! | [`node`] | the one iceoryx2 node of a process | |
-//! | [`frame`] | the stereo topic that a camera driver publishes, with an example | `LAYOUT.md`, `python/publish_stereo.py` |
+//! | [`frame`] | the stereo topic of a camera driver, with an example | `LAYOUT.md`, `python/publish_stereo.py` |
 //! | [`control`] | telemetry out of the daemon, requests into it | `CONTROL.md` |
 //! | [`ShmError`], [`frame::FrameError`] | why a topic cannot be opened, why a sample is refused | |
 //! | [`Vital`], `private` | files whose loss cuts the daemon off; their permissions | `CONTROL.md` |
 //!
-//! Whatever arrives through shared memory was written by another process and is not trusted: sizes, stamps and identities
-//! are checked against the sample that arrived before a pixel is read. Each refusal is a typed, counted
+//! Whatever arrives through shared memory was written by another process and is not trusted: sizes, stamps and
+//! identities are checked against the sample that arrived before a pixel is read. Each refusal is a typed, counted
 //! [`frame::FrameError`].
 
 pub mod control;

@@ -13,8 +13,8 @@ const MAX_NAME_BYTES: usize = 32;
 
 /// Root folder, prefix and cell. Two processes meet only if all three are equal.
 ///
-/// The root folder holds iceoryx2's discovery files. The prefix starts the name of every object in `/dev/shm`, one flat folder
-/// for the machine: two root folders therefore need two prefixes. The cell starts every service name.
+/// The root folder holds iceoryx2's discovery files. The prefix starts the name of every object in `/dev/shm`, one flat
+/// folder for the machine: two root folders therefore need two prefixes. The cell starts every service name.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Names {
     root: PathBuf,

@@ -8,8 +8,8 @@ pub type Ipc = ipc::Service;
 
 /// A process's node, with the names it was created with.
 ///
-/// It is `Send`: create it in `main` and move it to where ports are created. Ports (publisher, subscriber) are not `Send`:
-/// create them on the thread that uses them.
+/// It is `Send`: create it in `main` and move it to where ports are created. Ports (publisher, subscriber) are not
+/// `Send`: create them on the thread that uses them.
 #[derive(Debug)]
 pub struct ShmNode {
     node: Node<Ipc>,

@@ -1,10 +1,11 @@
-//! iceoryx2's node counter, made private: the one segment that iceoryx2 creates with mode 0666, and that every new node opens.
+//! iceoryx2's node counter, made private: the one segment that iceoryx2 creates with mode 0666, and that every new node
+//! opens.
 //!
-//! A user who can write to it can keep every program of the cell from creating a node, and so from sending a request. It is
-//! therefore created here, before iceoryx2 looks for it, with mode 0600. A segment of another user is refused. One that is
-//! open to others (created by a program that does not do this) is replaced by a private copy; processes that have the old
-//! one open hold a file that is no longer used. The layout is that of the pinned version of iceoryx2; the test
-//! `a_node_uses_the_private_segment` compares the two.
+//! A user who can write to it can keep every program of the cell from creating a node, and so from sending a request.
+//! It is therefore created here, before iceoryx2 looks for it, with mode 0600. A segment of another user is refused.
+//! One that is open to others (created by a program that does not do this) is replaced by a private copy; processes
+//! that have the old one open hold a file that is no longer used. The layout is that of the pinned version of iceoryx2;
+//! the test `a_node_uses_the_private_segment` compares the two.
 
 use crate::names::NamesError;
 use crate::{Names, ShmError};
@@ -85,7 +86,8 @@ fn inspect(folder: &OwnedFd, name: &str, shown: &str) -> Result<Found, NamesErro
 fn make(folder: &OwnedFd, name: &str, content: &[u8], replace: bool) -> Result<(), Errno> {
     let fresh = format!("{name}.{}", std::process::id());
     let flags = OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL | OFlags::NOFOLLOW | OFlags::CLOEXEC;
-    // A dead process with this number may have left the file; another user's file cannot be removed, and `openat` fails.
+    // A dead process with this number may have left the file; another user's file cannot be removed, and `openat`
+    // fails.
     let _ = unlinkat(folder, fresh.as_str(), AtFlags::empty());
     let file = openat(folder, fresh.as_str(), flags, Mode::from_raw_mode(0o600))?;
     let placed = rustix::io::write(&file, content).and_then(|_| {

@@ -1,9 +1,9 @@
 //! Watches the files through which other processes reach the daemon, because their loss has no other symptom.
 //!
-//! A mapped segment remains usable after its name is deleted. A tmp cleaner, `RemoveIPC` or a mistake can so leave a daemon
-//! that drives the arm and that no request reaches. A segment is identified by inode, size, owner and its first bytes (the
-//! version of iceoryx2), not by its modification time, which the first write through a new mapping changes. A discovery
-//! file is written once and never mapped, so there the modification time counts.
+//! A mapped segment remains usable after its name is deleted. A tmp cleaner, `RemoveIPC` or a mistake can so leave a
+//! daemon that drives the arm and that no request reaches. A segment is identified by inode, size, owner and its first
+//! bytes (the version of iceoryx2), not by its modification time, which the first write through a new mapping changes.
+//! A discovery file is written once and never mapped, so there the modification time counts.
 
 use crate::ShmNode;
 use crate::private::{self, FOLDER};
@@ -53,8 +53,8 @@ fn list(folder: &Path) -> Vec<PathBuf> {
 }
 
 impl Vital {
-    /// Watches all files of this process's node (its own, the services it has opened, the data of its ports, the node counter)
-    /// and `more`. Call it when all ports exist, on an ordinary thread: it reads folders and files.
+    /// Watches all files of this process's node (its own, the services it has opened, the data of its ports, the node
+    /// counter) and `more`. Call it when all ports exist, on an ordinary thread: it reads folders and files.
     pub fn of(node: &ShmNode, more: &[PathBuf]) -> Vital {
         let (names, number) = (node.names(), node.number());
         let own = list(&names.root().join("nodes").join(&number));

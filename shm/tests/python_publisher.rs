@@ -1,4 +1,5 @@
-//! The documented layout, tested with a publisher in another language: `python/publish_stereo.py` in a virtual environment.
+//! The documented layout, tested with a publisher in another language: `python/publish_stereo.py` in a virtual
+//! environment.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod common;

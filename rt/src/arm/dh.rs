@@ -1,11 +1,11 @@
 //! The Denavit-Hartenberg table, which holds all that is known of an arm's geometry.
 
-/// Denavit-Hartenberg table, standard convention: frame i is frame i-1 turned by `q + theta` about z, shifted by `d` along z
-/// and by `a` along the new x, and turned by `alpha` about it.
+/// Denavit-Hartenberg table, standard convention: frame i is frame i-1 turned by `q + theta` about z, shifted by `d`
+/// along z and by `a` along the new x, and turned by `alpha` about it.
 ///
-/// The base frame is UR's own (the pendant's "Base"), without the half turn of the URDF's `base_link`. The calibration of a
-/// unit adds small offsets in all columns. Its `d` of joints 2 and 3 may be large and opposite: their axes are parallel, so
-/// only the sum matters.
+/// The base frame is UR's own (the pendant's "Base"), without the half turn of the URDF's `base_link`. The calibration
+/// of a unit adds small offsets in all columns. Its `d` of joints 2 and 3 may be large and opposite: their axes are
+/// parallel, so only the sum matters.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Dh {
     /// Link lengths, metres.

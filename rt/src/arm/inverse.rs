@@ -1,4 +1,5 @@
-//! Inverse kinematics: the closed form of the nominal geometry, then a bounded Newton iteration on the calibrated table.
+//! Inverse kinematics: the closed form of the nominal geometry, then a bounded Newton iteration on the calibrated
+//! table.
 
 use super::{Dh, Joints};
 use crate::geom::{Pose, Vec3, log_pose};
@@ -26,13 +27,14 @@ pub enum InverseError {
 const STEPS: usize = 30;
 /// Distance (m) and angle (rad) below which the iteration has converged.
 const TOLERANCE: f64 = 1e-9;
-/// How far a cosine may exceed 1 for a start to be worth an iteration: a calibrated unit may reach farther than the nominal one.
+/// How far a cosine may exceed 1 for a start to be worth an iteration: a calibrated unit may reach farther than the
+/// nominal one.
 const CALIBRATION_SLACK: f64 = 1e-2;
 
 /// Joint positions that put the flange at `base_from_flange`: of all branches the one nearest to `near` (rad).
 ///
-/// The closed form of the table's main lengths gives up to eight starts, and `near` is one more. Newton's iteration on the
-/// complete table refines each. Bounded work: at most nine starts of 30 steps.
+/// The closed form of the table's main lengths gives up to eight starts, and `near` is one more. Newton's iteration on
+/// the complete table refines each. Bounded work: at most nine starts of 30 steps.
 ///
 /// # Errors
 /// [`InverseError`]: out of reach, or no start converged.
@@ -98,8 +100,8 @@ pub fn newton(dh: &Dh, base_from_flange: &Pose, start: &Joints) -> Result<Joints
     Err(InverseError::NotConverged { position, angle: e.fixed_rows::<3>(3).norm() })
 }
 
-/// All branches of the nominal geometry, at most eight: alpha at quarter turns, a and d where UR's design has them. Other
-/// entries of the table are ignored. `wrist3` (rad) is used where wrist 2 is straight, which leaves wrist 3 free.
+/// All branches of the nominal geometry, at most eight: alpha at quarter turns, a and d where UR's design has them.
+/// Other entries of the table are ignored. `wrist3` (rad) is used where wrist 2 is straight, which leaves wrist 3 free.
 pub fn closed_form(dh: &Dh, base_from_flange: &Pose, wrist3: f64) -> heapless::Vec<Joints, 8> {
     branches(dh, base_from_flange, wrist3, 1e-12)
 }

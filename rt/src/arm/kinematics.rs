@@ -50,8 +50,8 @@ impl Dh {
 
     /// Motion of the gripper between two sets of joint positions: its pose at `q_to` in its frame at `q_from`.
     ///
-    /// The base cancels, so prediction needs nothing else of the arm. The effect of an error in the table scales with the motion
-    /// and vanishes at rest.
+    /// The base cancels, so prediction needs nothing else of the arm. The effect of an error in the table scales with
+    /// the motion and vanishes at rest.
     pub fn gripper_motion(&self, q_from: &Joints, q_to: &Joints, flange_from_gripper: &Pose) -> Pose {
         self.base_from_gripper(q_from, flange_from_gripper).inverse()
             * self.base_from_gripper(q_to, flange_from_gripper)

@@ -1,4 +1,7 @@
-//! The arm: its state as read, its command as sent, its kinematics.
+//! The arm: models (`models`), Denavit-Hartenberg table (`dh`), forward (`kinematics`), differential (`jacobian`) and
+//! inverse kinematics (`inverse`), state and command (`state`).
+//!
+//! A new robot model is a variant of [`Model`] and one line in each of its tables.
 
 mod dh;
 mod inverse;

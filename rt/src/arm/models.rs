@@ -1,7 +1,8 @@
 //! The Universal Robots arms that graspd knows: nominal geometry, joint ranges, joint speeds.
 //!
-//! Sources: UR's article "DH Parameters for calculations of kinematics and dynamics" and UR's ROS 2 description 2.4.5, which
-//! agree where both state a value. Old CB3 manuals print other revisions; the calibration of a unit overrides all of it.
+//! Sources: UR's article "DH Parameters for calculations of kinematics and dynamics" and UR's ROS 2 description 2.4.5,
+//! which agree where both state a value. Old CB3 manuals print other revisions; the calibration of a unit overrides all
+//! of it.
 
 use super::{Dh, Joints};
 use core::f64::consts::{FRAC_PI_2, TAU};
@@ -123,8 +124,8 @@ const fn joint(range: f64, degrees_per_s: f64) -> JointRange {
     JointRange { min: -range, max: range, speed: degrees_per_s * (core::f64::consts::PI / 180.0) }
 }
 
-/// Joint positions in the middle of the workspace, elbow up, tool down, away from every singularity: the start of tests and of
-/// the mock arm, rad.
+/// Joint positions in the middle of the workspace, elbow up, tool down, away from every singularity: the start of tests
+/// and of the mock arm, rad.
 pub const READY: Joints = [0.0, -1.6, 1.9, -1.87, -FRAC_PI_2, 0.0];
 
 #[cfg(test)]

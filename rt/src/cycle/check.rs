@@ -1,4 +1,5 @@
-//! Checks a set-point, and the path to it before the first step: marks in view, arm in reach, no singularity, joints in range.
+//! Checks a set-point, and the path to it before the first step: marks in view, arm in reach, no singularity, joints in
+//! range.
 
 use super::settings::CycleConfig;
 use crate::arm::{Joints, newton};
@@ -48,8 +49,8 @@ fn goal_points(c: &CycleConfig, goal: &Goal, best: View) -> Result<u8, Reject> {
 
 /// Whether the path from `pose` (gripper in the rig now, joints `q`) over the pre-grasp to the grasp is possible.
 ///
-/// Only the motion relative to the gripper's pose is needed, not the pose of the rig in the robot's base. Bounded work: 16
-/// poses, each with a few Newton steps.
+/// Only the motion relative to the gripper's pose is needed, not the pose of the rig in the robot's base. Bounded work:
+/// 16 poses, each with a few Newton steps.
 pub(super) fn path(c: &CycleConfig, limits: &Limits, pose: &Pose, q: &Joints, s: &SetPoint) -> Result<(), Reject> {
     let mount = &c.gripper.flange_from_gripper;
     let base_from_left = c.dh.base_from_gripper(q, mount) * pose.inverse();

@@ -36,8 +36,8 @@ impl Convergence {
         *self = Self { progress_ns: now_ns, ..Self::new(self.settings) };
     }
 
-    /// Takes the correction of a new image. It counts as steady when the reference has `ended` and the filtered correction
-    /// is within `factor` times the tolerance.
+    /// Takes the correction of a new image. It counts as steady when the reference has `ended` and the filtered
+    /// correction is within `factor` times the tolerance.
     pub(super) fn observe(&mut self, screw: &Screw, ended: bool, factor: f64) {
         let filtered = match self.filtered {
             None => screw.correction,
@@ -66,8 +66,9 @@ impl Convergence {
             && screw.error_px <= c.error_px * factor.max(1.0)
     }
 
-    /// Notes the distance to the end of the leg (m, unit-scaled) and returns the smaller of it and the distance that the
-    /// correction and the reference still have to go. The reference's own motion counts as progress, and so does a probe.
+    /// Notes the distance to the end of the leg (m, unit-scaled) and returns the smaller of it and the distance that
+    /// the correction and the reference still have to go. The reference's own motion counts as progress, and so does a
+    /// probe.
     pub(super) fn note_distance(&mut self, law: &LawSettings, left_m: f64, ended: bool, now_ns: u64) -> f64 {
         let correction_m = self.filtered.map_or(f64::INFINITY, |f| law.size(&f));
         let left_m = left_m.min(correction_m + if ended { 0.0 } else { left_m });

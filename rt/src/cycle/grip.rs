@@ -29,8 +29,8 @@ impl Grip {
     }
 }
 
-/// Time after a command in which the outputs may still show the command before it, ns: three steps at 125 Hz to the script,
-/// and three back.
+/// Time after a command in which the outputs may still show the command before it, ns: three steps at 125 Hz to the
+/// script, and three back.
 const SETTLE_NS: u64 = 100_000_000;
 
 /// The last command and the outputs that were read.
@@ -81,8 +81,8 @@ impl TaskSettings {
         (self.close_outputs | self.open_outputs) >> 16 != 0
     }
 
-    /// State of the gripper from the controller's outputs. If outputs are configured for one direction only, any other value
-    /// is the other direction.
+    /// State of the gripper from the controller's outputs. If outputs are configured for one direction only, any other
+    /// value is the other direction.
     pub fn grip(&self, levels: u32) -> Grip {
         let matches = |word: u32| (word >> 16 != 0).then_some((levels ^ word) & (word >> 16) == 0);
         match (matches(self.close_outputs), matches(self.open_outputs)) {
@@ -96,8 +96,8 @@ impl TaskSettings {
     }
 }
 
-/// Whether the outputs of closing and opening cannot be distinguished: no output that both set is set differently. Opening
-/// would then not undo closing, and the state could not be read back. Mask and values, 16 bits each.
+/// Whether the outputs of closing and opening cannot be distinguished: no output that both set is set differently.
+/// Opening would then not undo closing, and the state could not be read back. Mask and values, 16 bits each.
 pub const fn same_words(close: u32, open: u32) -> bool {
     let both = close >> 16 & open >> 16;
     close >> 16 != 0 && open >> 16 != 0 && (close ^ open) & both == 0

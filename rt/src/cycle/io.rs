@@ -41,7 +41,8 @@ pub enum RequestKind {
         /// `true` to close, `false` to open.
         close: bool,
     },
-    /// Close the gripper and turn the valve about its axis by an angle (rad, right-handed about the normal towards the cameras).
+    /// Close the gripper and turn the valve about its axis by an angle (rad, right-handed about the normal towards the
+    /// cameras).
     Turn {
         /// The angle, rad.
         angle_rad: f64,
@@ -184,7 +185,8 @@ pub struct CycleRecord {
     pub reference: Pose,
     /// Distance of the marks from the reference, pixels rms per coordinate; NaN while the law does not drive.
     pub error_px: f64,
-    /// Part of `error_px` that no motion can remove, pixels: noise and calibration error; NaN while the law does not drive.
+    /// Part of `error_px` that no motion can remove, pixels: noise and calibration error; NaN while the law does not
+    /// drive.
     pub residual_px: f64,
     /// Motion that would bring the marks onto the reference, gripper frame `[v; ω]` (m, rad).
     pub correction: Twist,
@@ -198,7 +200,8 @@ pub struct CycleRecord {
     pub held: Held,
     /// Fraction of the full speed in force (age of data, marks, singularity, guard), 0 to 1.
     pub scale: f64,
-    /// Smallest singular value of the stacked interaction matrices, px/m; NaN while the law does not drive, as the next two.
+    /// Smallest singular value of the stacked interaction matrices, px/m; NaN while the law does not drive, as the next
+    /// two.
     pub mark_sigma: f64,
     /// Condition number of the stacked interaction matrices.
     pub mark_condition: f64,

@@ -1,7 +1,7 @@
 //! One cycle of the command thread: newest robot state and vision result in, one set-point out.
 //!
-//! [`CommandCycle::step`] gathers, decides, moves, and records. It reads no clock and does no IO; the same inputs give the
-//! same outputs to the bit. In reading order:
+//! [`CommandCycle::step`] gathers, decides, moves, and records. It reads no clock and does no IO; the same inputs give
+//! the same outputs to the bit. In reading order:
 //!
 //! | file | content |
 //! |---|---|
@@ -14,7 +14,8 @@
 //! | `work`, `grip` | what follows convergence: close, turn, open, retreat |
 //! | `record` | what is sent and recorded |
 //!
-//! Every rate that is sent comes out of [`Guard::step`] or [`Guard::stop`]; [`CommandCycle::step`] is their only caller.
+//! Every rate that is sent comes out of [`Guard::step`] or [`Guard::stop`]; [`CommandCycle::step`] is their only
+//! caller.
 
 mod check;
 mod convergence;
@@ -56,8 +57,8 @@ use watch_arm::ArmWatch;
 use watch_vision::{Taken, VisionWatch};
 use work::Work;
 
-/// Fraction of the gripper's speed cap that the law aims at: below the guard's own 0.95, so that the guard, which keeps the
-/// cap, rarely has to slow the motion.
+/// Fraction of the gripper's speed cap that the law aims at: below the guard's own 0.95, so that the guard, which keeps
+/// the cap, rarely has to slow the motion.
 const TCP_AIM: f64 = 0.9;
 
 /// The command half of the loop.
@@ -120,7 +121,8 @@ impl CommandCycle {
     /// A cycle at rest in [`Mode::Idle`].
     ///
     /// # Errors
-    /// [`LimitError`]: a limit is above its compiled ceiling, or a stop from full speed would take too long or go too far.
+    /// [`LimitError`]: a limit is above its compiled ceiling, or a stop from full speed would take too long or go too
+    /// far.
     pub fn new(config: CycleConfig) -> Result<Self, LimitError> {
         let s = &config.settings;
         let limits = Limits::new(&s.limits, config.model, s.period_ns)?;
@@ -163,8 +165,8 @@ impl CommandCycle {
 
     /// Runs one cycle: the only function of graspd whose result may set the arm in motion.
     ///
-    /// Bounded work: at most 64 marks projected a few times each, three 6x6 eigenvalue problems; once per accepted `servo`
-    /// request, 16 short Newton iterations.
+    /// Bounded work: at most 64 marks projected a few times each, three 6x6 eigenvalue problems; once per accepted
+    /// `servo` request, 16 short Newton iterations.
     pub fn step(&mut self, input: &CommandInput) -> CommandOutput {
         let tick = self.tick(input.now_ns);
         let now = tick.now_ns;
@@ -208,7 +210,8 @@ impl CommandCycle {
     fn gather(&mut self, input: &CommandInput) {
         let now = input.now_ns;
         if input.link.connected && !self.arm.connected() {
-            // A new script acts on the first outputs that it receives, so those of the last session must not be repeated.
+            // A new script acts on the first outputs that it receives, so those of the last session must not be
+            // repeated.
             self.outputs = 0;
         }
         if self.arm.observe(now, input.robot.as_ref(), input.link) {

@@ -1,8 +1,9 @@
-//! The probe at the start of every motion: the arm moves slowly until the images show that the gripper moves as commanded.
+//! The probe at the start of every motion: the arm moves slowly until the images show that the gripper moves as
+//! commanded.
 //!
-//! It detects what no check of the configuration can: an inverted mounting, a wrong model, swapped cameras or a gain of the
-//! wrong sign. It compares the *commanded* motion (the sum of the screws sent) with the *seen* motion (the pose from the
-//! images).
+//! It detects what no check of the configuration can: an inverted mounting, a wrong model, swapped cameras or a gain of
+//! the wrong sign. It compares the *commanded* motion (the sum of the screws sent) with the *seen* motion (the pose
+//! from the images).
 
 use super::settings::WatchSettings;
 use crate::geom::{Pose, Twist, exp_twist, log_pose};
@@ -39,7 +40,8 @@ impl Probe {
         self.passed
     }
 
-    /// Notes a screw (gripper frame) sent for `dt_s` seconds, of which the controller's slider lets the fraction `slider` through.
+    /// Notes a screw (gripper frame) sent for `dt_s` seconds, of which the controller's slider lets the fraction
+    /// `slider` through.
     pub(super) fn note_sent(&mut self, screw: &Twist, slider: f64, dt_s: f64) {
         if !self.passed {
             self.intended *= exp_twist(&(screw * (slider * dt_s)));

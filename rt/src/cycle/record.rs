@@ -19,8 +19,8 @@ impl CommandCycle {
         self.heartbeat = self.heartbeat.wrapping_add(1);
         let mode = match self.mode {
             Mode::Servoing | Mode::Converged | Mode::Stopping(_) => ArmMode::Velocity,
-            // A fault is reached at rest and latched here. The control script clears its own fault on idle only; with any
-            // other mode a reset would never find the cause gone.
+            // A fault is reached at rest and latched here. The control script clears its own fault on idle only; with
+            // any other mode a reset would never find the cause gone.
             Mode::Idle | Mode::Tracking | Mode::Armed | Mode::Fault(_) => ArmMode::Idle,
         };
         let rates = if mode == ArmMode::Velocity { *self.guard.last() } else { [0.0; 6] };

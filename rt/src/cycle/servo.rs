@@ -1,9 +1,9 @@
 //! The control law of one cycle: where the gripper is, where it should be, and the joint rates that lead there.
 //!
-//! The marks of the newest image are moved to now by the joints ([`crate::online::predict`]), compared with the reference's
-//! marks ([`crate::online::path`]), and stacked and solved for the gripper's screw ([`crate::online::screw`], with the
-//! interaction matrix of [`crate::online::interaction`]), which the arm's Jacobian turns into joint rates
-//! ([`crate::online::rates`]).
+//! The marks of the newest image are moved to now by the joints ([`crate::online::predict`]), compared with the
+//! reference's marks ([`crate::online::path`]), and stacked and solved for the gripper's screw
+//! ([`crate::online::screw`], with the interaction matrix of [`crate::online::interaction`]), which the arm's Jacobian
+//! turns into joint rates ([`crate::online::rates`]).
 
 use super::io::Stage;
 use super::settings::CycleConfig;
@@ -145,7 +145,8 @@ impl Motion {
         stack.solve()
     }
 
-    /// One cycle: pose now, correction, screw `ξ = λ · correction + feed-forward` and joint rates within the speed caps.
+    /// One cycle: pose now, correction, screw `ξ = λ · correction + feed-forward` and joint rates within the speed
+    /// caps.
     ///
     /// # Errors
     /// The marks or the arm do not allow a finite, well-conditioned solution.

@@ -49,13 +49,13 @@ impl Default for ConvergeSettings {
 pub struct WatchSettings {
     /// Largest age of the robot state, ns. Default 20 ms.
     pub state_age_ns: u64,
-    /// Smallest fraction of the controller's states that must arrive, over the last whole second. Default 0.8; with fewer, the
-    /// delays are not those that the law is tuned for.
+    /// Smallest fraction of the controller's states that must arrive, over the last whole second. Default 0.8; with
+    /// fewer, the delays are not those that the law is tuned for.
     pub state_share: f64,
     /// Age of the newest image at which the arm is stopped, ns; three frame periods if that is more. Default 100 ms.
     pub frame_age_ns: u64,
-    /// Largest difference between the capture stamps of left and right, ns; a quarter of the frame period if that is less.
-    /// Default 5 ms.
+    /// Largest difference between the capture stamps of left and right, ns; a quarter of the frame period if that is
+    /// less. Default 5 ms.
     pub skew_ns: u64,
     /// Longest time without a change of the echoed heartbeat, ns. Default 50 ms.
     pub echo_ns: u64,
@@ -71,29 +71,29 @@ pub struct WatchSettings {
     pub uncommanded_rad_per_s: f64,
     /// Longest time above `uncommanded_rad_per_s`, ns. Default 30 ms.
     pub uncommanded_ns: u64,
-    /// Allowed difference between the controller's speed of its tool point and the computed one, m/s. Default 0.01: three times
-    /// the encoders' speed noise (0.003 rad/s) at one metre of arm.
+    /// Allowed difference between the controller's speed of its tool point and the computed one, m/s. Default 0.01:
+    /// three times the encoders' speed noise (0.003 rad/s) at one metre of arm.
     pub tool_m_per_s: f64,
-    /// Additional allowed difference as a fraction of the faster of the two. Default 0.1: a session begins with kinematics that
-    /// are off by 30 mm at most, 6 % of half a metre of arm; a limit of 0.25 m/s is then never exceeded by more than
-    /// 0.04 m/s without a fault.
+    /// Additional allowed difference as a fraction of the faster of the two. Default 0.1: a session begins with
+    /// kinematics that are off by 30 mm at most, 6 % of half a metre of arm; a limit of 0.25 m/s is then never exceeded
+    /// by more than 0.04 m/s without a fault.
     pub tool_share: f64,
     /// Longest time above that difference, ns. Default 60 ms.
     pub tool_ns: u64,
     /// Time after the last set-point in which a joint may still move, ns. Default 250 ms.
     pub settle_ns: u64,
-    /// Disagreement of images and joints between two images from which a result is refused, metres (unit-scaled). Default
-    /// 0.012.
+    /// Disagreement of images and joints between two images from which a result is refused, metres (unit-scaled).
+    /// Default 0.012.
     pub jump_m: f64,
-    /// Disagreement over six images that counts as a mismatch, metres (unit-scaled); `mismatch_share` of the motion if that is
-    /// more. Default 0.005.
+    /// Disagreement over six images that counts as a mismatch, metres (unit-scaled); `mismatch_share` of the motion if
+    /// that is more. Default 0.005.
     pub mismatch_m: f64,
     /// See `mismatch_m`. Default 0.4.
     pub mismatch_share: f64,
     /// Consecutive images with a mismatch that are a fault. Default 6.
     pub mismatch_frames: u32,
-    /// Missed cycles within one to two seconds above which the arm is held; 0 only counts them (a host without real-time
-    /// scheduling). Default 5.
+    /// Missed cycles within one to two seconds above which the arm is held; 0 only counts them (a host without
+    /// real-time scheduling). Default 5.
     pub overruns_per_s: u32,
     /// Longest time without a cycle, ns. Default 20 ms.
     pub stall_ns: u64,
@@ -105,8 +105,8 @@ pub struct WatchSettings {
     pub probe_share: f64,
     /// Commanded motion after which the probe decides, metres (unit-scaled). Default 0.003.
     pub probe_m: f64,
-    /// Smallest fraction of the commanded motion that must be seen in the images, and largest fraction of it that may be seen
-    /// across its direction. Default 0.4.
+    /// Smallest fraction of the commanded motion that must be seen in the images, and largest fraction of it that may
+    /// be seen across its direction. Default 0.4.
     pub probe_agreement: f64,
     /// Motion at which a probe that has not passed is a fault, metres (unit-scaled). Default 0.012.
     pub probe_limit_m: f64,
@@ -148,8 +148,8 @@ impl Default for WatchSettings {
 }
 
 impl WatchSettings {
-    /// For a host without real-time scheduling: missed cycles are only counted, and robot state, images and the loop may be twice
-    /// as late. The robot-side watchdog of 50 ms is unchanged.
+    /// For a host without real-time scheduling: missed cycles are only counted, and robot state, images and the loop
+    /// may be twice as late. The robot-side watchdog of 50 ms is unchanged.
     pub fn best_effort() -> Self {
         let d = Self::default();
         Self {
@@ -167,7 +167,8 @@ impl WatchSettings {
 /// Gripper outputs, and the motions after convergence.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TaskSettings {
-    /// Output bits that close the gripper: mask in the upper 16 bits, values in the lower 16; 0 for no output. Default 0.
+    /// Output bits that close the gripper: mask in the upper 16 bits, values in the lower 16; 0 for no output. Default
+    /// 0.
     pub close_outputs: u32,
     /// Output bits that open it, likewise. Default 0.
     pub open_outputs: u32,
@@ -233,8 +234,8 @@ impl Default for CycleSettings {
     }
 }
 
-/// Everything that a cycle is built from. The pose of the rig relative to the robot is not part of it: the loop does not need
-/// it.
+/// Everything that a cycle is built from. The pose of the rig relative to the robot is not part of it: the loop does
+/// not need it.
 #[derive(Clone, Debug)]
 pub struct CycleConfig {
     /// The arm's model: joint ranges and speeds.

@@ -36,8 +36,8 @@ impl CommandCycle {
         self.vision.fault(tick.now_ns)
     }
 
-    /// How far the set-point would lead the gripper astray because a camera moved after it was given, metres (unit-scaled);
-    /// `None` if none moved.
+    /// How far the set-point would lead the gripper astray because a camera moved after it was given, metres
+    /// (unit-scaled); `None` if none moved.
     pub(super) fn camera_moved(&self) -> Option<f64> {
         let rig = self.vision.rig()?;
         self.setpoint_moves.filter(|then| *then != rig.moves).map(|_| rig.astray_m)

@@ -18,8 +18,8 @@ const RUNTIME_STATE_PLAYING: u32 = 2;
 const MAX_POSITION_RAD: f64 = 1e3;
 /// Largest plausible joint velocity, rad/s: three times the fastest joint of all models.
 const MAX_VELOCITY_RAD_PER_S: f64 = 20.0;
-/// Largest plausible change of a joint position between two states: this angle, rad, plus the speed below times the time
-/// between them.
+/// Largest plausible change of a joint position between two states: this angle, rad, plus the speed below times the
+/// time between them.
 const MAX_STEP_RAD: f64 = 0.02;
 /// Above the 6.3 rad/s of the fastest joint, rad/s.
 const MAX_STEP_RAD_PER_S: f64 = 7.5;
@@ -182,7 +182,8 @@ impl ArmWatch {
         }
     }
 
-    /// Compares measured velocities with the range of the set-points of the last [`DELAY_NS`]; inside it there is no error.
+    /// Compares measured velocities with the range of the set-points of the last [`DELAY_NS`]; inside it there is no
+    /// error.
     fn compare_motion(&mut self, now_ns: u64, old: &RobotState, new: &RobotState) {
         let dt = (new.timestamp_s - old.timestamp_s).clamp(0.0, 0.05);
         let slow = self.slider_of(new);
@@ -210,8 +211,8 @@ impl ArmWatch {
         self.creeping_since_ns = if resting && creeping { self.creeping_since_ns.or(Some(now_ns)) } else { None };
     }
 
-    /// Compares the controller's speed of its tool point with the one that the configured kinematics give for the same point
-    /// (`tool.1`, m/s). If they differ, the kinematics are wrong, and the gripper's speed cap does not hold.
+    /// Compares the controller's speed of its tool point with the one that the configured kinematics give for the same
+    /// point (`tool.1`, m/s). If they differ, the kinematics are wrong, and the gripper's speed cap does not hold.
     pub(super) fn compare_tool(&mut self, now_ns: u64, tool: Option<(ToolPoint, f64)>) {
         let Some((point, computed)) = tool else {
             self.tool_off_since_ns = None;
@@ -264,8 +265,8 @@ impl ArmWatch {
 
     /// The fault of the robot now, the most fundamental first; `None` when the arm may be driven.
     ///
-    /// `watched` adds what matters only while the arm is armed or driven: whether it follows its set-points and rests without
-    /// them.
+    /// `watched` adds what matters only while the arm is armed or driven: whether it follows its set-points and rests
+    /// without them.
     pub(super) fn fault(&self, now_ns: u64, watched: bool) -> Option<FaultCause> {
         let w = &self.settings;
         if let Some(s) = &self.state {
@@ -352,8 +353,8 @@ impl ArmWatch {
         self.good_since_ns.map(|t| now_ns.saturating_sub(t))
     }
 
-    /// Forgets an implausible state after a second of plausible ones. Only while the arm is not armed: then nothing has latched
-    /// that an operator would reset.
+    /// Forgets an implausible state after a second of plausible ones. Only while the arm is not armed: then nothing has
+    /// latched that an operator would reset.
     pub(super) fn outlive_event(&mut self, now_ns: u64) {
         if now_ns.saturating_sub(self.event_ns) > EVENT_NS {
             self.event = None;

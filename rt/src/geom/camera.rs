@@ -3,7 +3,8 @@
 use super::{Normalized, Pixel, Vec3};
 use nalgebra::{Matrix2, Matrix2x3, Vector2};
 
-/// Distortion coefficients in OpenCV's order and meaning: radial k1, k2, tangential p1, p2, radial k3, denominator k4, k5, k6.
+/// Distortion coefficients in OpenCV's order and meaning: radial k1, k2, tangential p1, p2, radial k3, denominator k4,
+/// k5, k6.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 #[allow(missing_docs)]
 pub struct Distortion {
@@ -149,8 +150,8 @@ impl Camera {
         Some(self.distort(Vector2::new(x.x / x.z, x.y / x.z)))
     }
 
-    /// Pixel of a point in this camera's frame, with its derivative by the point (2x3, pixels per metre); `None` at or behind the
-    /// projection centre.
+    /// Pixel of a point in this camera's frame, with its derivative by the point (2x3, pixels per metre); `None` at or
+    /// behind the projection centre.
     pub fn project_with_jacobian(&self, x: &Vec3) -> Option<(Pixel, Matrix2x3<f64>)> {
         if !(x.z > 1e-9) {
             return None;

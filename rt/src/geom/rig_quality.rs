@@ -1,9 +1,10 @@
 //! The error of a calibrated rig and its effect on the images, from which the gates in pixels follow.
 //!
-//! Nine unknowns describe how a rig differs from its file: rotation of the right camera about its centre (three), both focal
-//! lengths (common part and half the difference), both principal points (four). An error of the baseline's length only
-//! scales the scene; an error of its direction is, at one distance, equivalent to a rotation. The unknowns are independent
-//! and normal with the standard deviations of a [`RigError`]. They are small, so everything is linear in them.
+//! Nine unknowns describe how a rig differs from its file: rotation of the right camera about its centre (three), both
+//! focal lengths (common part and half the difference), both principal points (four). An error of the baseline's length
+//! only scales the scene; an error of its direction is, at one distance, equivalent to a rotation. The unknowns are
+//! independent and normal with the standard deviations of a [`RigError`]. They are small, so everything is linear in
+//! them.
 
 use super::{Pixel, Pose, Rig, Vec3, View, exp_twist};
 use crate::math;
@@ -12,8 +13,8 @@ use nalgebra::{Matrix2x3, SMatrix, SVector, Vector2, Vector6};
 /// Number of unknowns of a rig's error.
 pub const RIG_UNKNOWNS: usize = 9;
 
-/// The unknowns, in order: rotation of the right camera about its x, y, z (rad); focal lengths, common part and half the
-/// difference right minus left (relative); principal points, left u, v and right u, v (pixels).
+/// The unknowns, in order: rotation of the right camera about its x, y, z (rad); focal lengths, common part and half
+/// the difference right minus left (relative); principal points, left u, v and right u, v (pixels).
 pub type RigOffset = SVector<f64, RIG_UNKNOWNS>;
 
 /// Derivative of a pixel by a [`RigOffset`].
@@ -21,7 +22,8 @@ pub type RigJacobian = SMatrix<f64, 2, RIG_UNKNOWNS>;
 
 /// Standard deviations of the error of a rig.
 ///
-/// The default is that of a careful calibration with a printed target. It is assumed for a rig whose file states no error.
+/// The default is that of a careful calibration with a printed target. It is assumed for a rig whose file states no
+/// error.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RigError {
     /// Relative rotation of the cameras, about each axis, rad. Default 0.1 degrees.
@@ -67,8 +69,8 @@ impl RigError {
         math::sqrt(offset.component_div(&self.deviations().map(|d| d.max(1e-12))).norm_squared())
     }
 
-    /// Standard deviation of the distance of a point's right image from the epipolar line of its left image, pixels. `x_left`
-    /// is the point in the left frame, metres; `None` if it is behind a camera or on the line through both.
+    /// Standard deviation of the distance of a point's right image from the epipolar line of its left image, pixels.
+    /// `x_left` is the point in the left frame, metres; `None` if it is behind a camera or on the line through both.
     pub fn epipolar_sigma_px(&self, rig: &Rig, x_left: &Vec3) -> Option<f64> {
         let (normal, left, right) = epipolar_normal(rig, x_left)?;
         let across = left.tr_mul(&normal[0]) + right.tr_mul(&normal[1]);
@@ -78,15 +80,16 @@ impl RigError {
     }
 }
 
-/// The direction in the four image coordinates of a point that no displacement of the point changes, and the derivatives of
-/// both pixels by the unknowns.
+/// The direction in the four image coordinates of a point that no displacement of the point changes, and the
+/// derivatives of both pixels by the unknowns.
 fn epipolar_normal(rig: &Rig, x_left: &Vec3) -> Option<([Vector2<f64>; 2], RigJacobian, RigJacobian)> {
     let (_, gl) = rig.project_with_jacobian(View::Left, x_left)?;
     let (_, gr) = rig.project_with_jacobian(View::Right, x_left)?;
     let (_, jl) = rig.project_with_offset(View::Left, x_left)?;
     let (_, jr) = rig.project_with_offset(View::Right, x_left)?;
-    // A motion of the point along the left ray does not change the left pixel and moves the right pixel along the epipolar
-    // line: the right part of the normal is across that line. The left part balances the other motions of the point.
+    // A motion of the point along the left ray does not change the left pixel and moves the right pixel along the
+    // epipolar line: the right part of the normal is across that line. The left part balances the other motions of the
+    // point.
     let along = gr * x_left;
     let across = Vector2::new(-along.y, along.x);
     let length = math::sqrt(across.norm_squared());
@@ -184,7 +187,8 @@ mod tests {
         }
     }
 
-    /// The predicted standard deviation is that of rigs drawn from the prior: distance of the right pixel from the epipolar line.
+    /// The predicted standard deviation is that of rigs drawn from the prior: distance of the right pixel from the
+    /// epipolar line.
     #[test]
     fn the_epipolar_deviation_agrees_with_drawn_rigs() {
         let (rig, error) = (rig(), RigError::default());
@@ -202,7 +206,8 @@ mod tests {
                 let o = error.deviations().map(|d| d * normal());
                 let truth = rig.offset(&o);
                 let (l, r) = (truth.project(View::Left, &x).unwrap(), truth.project(View::Right, &x).unwrap());
-                // With the nominal rig: the left pixel's ray, projected to the right as a line through two of its points.
+                // With the nominal rig: the left pixel's ray, projected to the right as a line through two of its
+                // points.
                 let ray = rig.left.undistort(l).unwrap();
                 let at = |z: f64| rig.project(View::Right, &Vec3::new(ray.x * z, ray.y * z, z)).unwrap();
                 let (a, b) = (at(x.z * 0.99), at(x.z * 1.01));

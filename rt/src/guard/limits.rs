@@ -14,13 +14,13 @@ pub mod ceiling {
 
 /// Longest stop from full speed, in time and distance, that the limits of a configuration may give.
 pub mod stop_bound {
-    /// Time until the rates sent are zero, seconds: twice what the default limits need, and well within the second that a
-    /// signal allows.
+    /// Time until the rates sent are zero, seconds: twice what the default limits need, and well within the second that
+    /// a signal allows.
     pub const TIME_S: f64 = 0.3;
     /// Travel of the fastest joint, rad (8.6 degrees): five times that of the default limits.
     pub const JOINT_RAD: f64 = 0.15;
-    /// Travel of the gripper's origin, m: three times that of the default limits, and less than the shortest default standoff
-    /// (80 mm), so that a stop that begins at the pre-grasp ends before the part.
+    /// Travel of the gripper's origin, m: three times that of the default limits, and less than the shortest default
+    /// standoff (80 mm), so that a stop that begins at the pre-grasp ends before the part.
     pub const TCP_M: f64 = 0.05;
 }
 
@@ -159,8 +159,9 @@ impl Limits {
         Ok(limits)
     }
 
-    /// The guard's stop from full speed, exact to the cycle: the rates shrink by A T per cycle for N cycles. The mean over the
-    /// last n cycles starts filled with the old rates, follows (n - 1) / 2 cycles later and ends n - 1 cycles later.
+    /// The guard's stop from full speed, exact to the cycle: the rates shrink by A T per cycle for N cycles. The mean
+    /// over the last n cycles starts filled with the old rates, follows (n - 1) / 2 cycles later and ends n - 1 cycles
+    /// later.
     pub fn stop_figures(&self) -> StopFigures {
         let fastest = self.velocity.iter().fold(0.0_f64, |m, v| m.max(*v));
         let (step, lag) = (self.acceleration * self.period_s, self.filter as f64 - 1.0);

@@ -1,14 +1,15 @@
 //! The last stage before the wire: every joint rate that is sent comes out of [`Guard::step`] or [`Guard::stop`].
 //!
-//! The guard does not trust the code that computed the rates. Whatever comes in, including NaN and infinite values, what
-//! goes out is finite and within the limits of joint speed, joint acceleration and gripper speed, and the arm can always
-//! stop before the end of every joint's range. Limits are kept by slowing all joints together, never by clipping single
-//! joints, so that the direction of the motion is preserved.
+//! The guard does not trust the code that computed the rates. Whatever comes in, including NaN and infinite values,
+//! what goes out is finite and within the limits of joint speed, joint acceleration and gripper speed, and the arm can
+//! always stop before the end of every joint's range. Limits are kept by slowing all joints together, never by clipping
+//! single joints, so that the direction of the motion is preserved.
 //!
-//! Why the arm can always stop: the *stop ramp* scales all rates together to zero at the acceleration limit. A step towards
-//! the requested rates is taken only if the stop ramp from there ends inside the joints' ranges; otherwise the step is that
-//! of the stop ramp. A ramp that was possible at the last step is possible now, so by induction there is always one. A mean
-//! over the last steps bounds the jerk; the mean of vectors within a convex limit is within that limit.
+//! Why the arm can always stop: the *stop ramp* scales all rates together to zero at the acceleration limit. A step
+//! towards the requested rates is taken only if the stop ramp from there ends inside the joints' ranges; otherwise the
+//! step is that of the stop ramp. A ramp that was possible at the last step is possible now, so by induction there is
+//! always one. A mean over the last steps bounds the jerk; the mean of vectors within a convex limit is within that
+//! limit.
 
 mod limits;
 
@@ -72,11 +73,11 @@ pub struct Guard {
     stopping: bool,
 }
 
-/// Fraction of the gripper's speed cap that a step aims at. The rest is for the change of the Jacobian within one length of
-/// the filter.
+/// Fraction of the gripper's speed cap that a step aims at. The rest is for the change of the Jacobian within one
+/// length of the filter.
 const TCP_AIM: f64 = 0.95;
-/// Fraction of the room to a joint's end within which a motion must be able to stop, so that it slows down before the stop
-/// ramp has to take over.
+/// Fraction of the room to a joint's end within which a motion must be able to stop, so that it slows down before the
+/// stop ramp has to take over.
 const POSITION_AIM: f64 = 0.8;
 
 impl Guard {
@@ -102,8 +103,9 @@ impl Guard {
 
     /// One step towards the rates `wanted` (rad/s).
     ///
-    /// `q` are the measured joint positions (rad) and `jacobian` the gripper's body Jacobian there. `share` (0 to 1) lowers the
-    /// speed caps (reduced mode, probe). `dt_s` is the time since the last step, seconds; more than one period counts as one.
+    /// `q` are the measured joint positions (rad) and `jacobian` the gripper's body Jacobian there. `share` (0 to 1)
+    /// lowers the speed caps (reduced mode, probe). `dt_s` is the time since the last step, seconds; more than one
+    /// period counts as one.
     pub fn step(&mut self, wanted: &Joints, q: &Joints, jacobian: &Matrix6<f64>, share: f64, dt_s: f64) -> Guarded {
         self.stopping = false;
         let dt = self.usable(dt_s);
@@ -137,11 +139,11 @@ impl Guard {
         Guarded { rates: self.emit(dt), held, scale }
     }
 
-    /// One step of the stop ramp from the rates sent last: all rates shrink together at the acceleration limit, and rest is
-    /// reached within [`Limits::ramp_ns`].
+    /// One step of the stop ramp from the rates sent last: all rates shrink together at the acceleration limit, and
+    /// rest is reached within [`Limits::ramp_ns`].
     ///
-    /// The first step starts from the rates on the wire, not from the input of the jerk filter, so that an accelerating arm
-    /// slows down immediately. That one step may exceed the jerk limit.
+    /// The first step starts from the rates on the wire, not from the input of the jerk filter, so that an accelerating
+    /// arm slows down immediately. That one step may exceed the jerk limit.
     pub fn stop(&mut self, dt_s: f64) -> Guarded {
         let dt = self.usable(dt_s);
         if !self.stopping {
@@ -157,7 +159,8 @@ impl Guard {
         if dt_s.is_finite() { dt_s.clamp(0.0, self.limits.period_s) } else { 0.0 }
     }
 
-    /// Largest fraction of `wanted` (at most 1) within the speed caps from which the arm can stop before the joints' ends.
+    /// Largest fraction of `wanted` (at most 1) within the speed caps from which the arm can stop before the joints'
+    /// ends.
     fn possible(&self, wanted: &Joints, q: &Joints, jacobian: &Matrix6<f64>, share: f64, held: &mut Held) -> f64 {
         let l = &self.limits;
         let mut scale = 1.0_f64;
@@ -201,12 +204,14 @@ impl Guard {
         if scale.is_finite() { scale.clamp(0.0, 1.0) } else { 0.0 }
     }
 
-    /// Time at full speed before a stop takes effect, seconds: the arm's reaction, a cycle each way, the delay of the filter.
+    /// Time at full speed before a stop takes effect, seconds: the arm's reaction, a cycle each way, the delay of the
+    /// filter.
     fn dead_s(&self) -> f64 {
         self.limits.reaction_s + self.limits.period_s * (2.0 + 0.5 * self.limits.filter as f64)
     }
 
-    /// Whether a stop ramp from `rates` at `q` ends inside every joint's range. Motion away from an end is always allowed.
+    /// Whether a stop ramp from `rates` at `q` ends inside every joint's range. Motion away from an end is always
+    /// allowed.
     fn can_stop(&self, rates: &Joints, q: &Joints) -> bool {
         let fastest = rates.iter().fold(0.0_f64, |m, v| m.max(math::fabs(*v)));
         let seconds = fastest / (2.0 * self.limits.acceleration) + self.dead_s();

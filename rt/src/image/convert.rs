@@ -39,8 +39,8 @@ fn check(
     Ok(())
 }
 
-/// Converts little-endian 16-bit words, of which the lowest `bits` are used (12 for unpacked mono12, 16 for mono16), to mono8,
-/// rounded down.
+/// Converts little-endian 16-bit words, of which the lowest `bits` are used (12 for unpacked mono12, 16 for mono16), to
+/// mono8, rounded down.
 ///
 /// `stride` is in bytes. A value above the maximum of the format becomes white.
 ///
@@ -70,8 +70,8 @@ pub fn mono16(
     Ok(())
 }
 
-/// Converts GigE Vision's packed mono12 (`Mono12p`: two pixels in three bytes, low nibble first) to mono8; the width must be
-/// even.
+/// Converts GigE Vision's packed mono12 (`Mono12p`: two pixels in three bytes, low nibble first) to mono8; the width
+/// must be even.
 ///
 /// `stride` is in bytes, at least `width * 3 / 2`.
 ///
@@ -106,9 +106,9 @@ pub fn mono12_packed(
 
 /// Converts an 8-bit Bayer mosaic to grey with a 3 x 3 kernel that weighs the colours equally at every pixel.
 ///
-/// Marks are black and white, so colour is not needed. The kernel (1 2 1) along both axes gives red and blue a quarter each and
-/// green a half at every pixel, whatever the phase of the mosaic; its order (RGGB, BGGR, GRBG, GBRG) need not be known. The
-/// kernel is symmetric and moves no edge.
+/// Marks are black and white, so colour is not needed. The kernel (1 2 1) along both axes gives red and blue a quarter
+/// each and green a half at every pixel, whatever the phase of the mosaic; its order (RGGB, BGGR, GRBG, GBRG) need not
+/// be known. The kernel is symmetric and moves no edge.
 ///
 /// # Errors
 /// [`ConvertError`].

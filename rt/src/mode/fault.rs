@@ -130,8 +130,8 @@ pub enum FaultCause {
         /// The value.
         value: f64,
     },
-    /// F-ARM-17: the controller's speed of its tool point differs from the one computed here: the configured kinematics are not
-    /// those of this arm.
+    /// F-ARM-17: the controller's speed of its tool point differs from the one computed here: the configured kinematics
+    /// are not those of this arm.
     ToolSpeed {
         /// By the controller, m/s.
         controller_m_per_s: f64,

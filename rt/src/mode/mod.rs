@@ -174,7 +174,8 @@ pub enum Action {
 pub const fn step(mode: Mode, event: Event, now_ns: u64) -> (Mode, Action) {
     use Mode::{Armed, Converged, Fault, Idle, Servoing, Stopping, Tracking};
     match (mode, event) {
-        // A fault latches in every mode in which the arm is armed or driven. In the others, lost readiness has the same effect.
+        // A fault latches in every mode in which the arm is armed or driven. In the others, lost readiness has the same
+        // effect.
         (Servoing | Converged, Event::Fault(cause)) => {
             (Stopping(After::Fault(Latched { cause, at_ns: now_ns })), Action::RampDown)
         }
@@ -258,8 +259,8 @@ mod tests {
         Event::Fault(CAUSE),
     ];
 
-    /// The next mode of each pair, one letter each: Idle, Tracking, Armed, Servoing, Converged, Stopping (t, a, f by what follows),
-    /// Fault; `.` unchanged, `x` refused. Columns as in `EVENTS`.
+    /// The next mode of each pair, one letter each: Idle, Tracking, Armed, Servoing, Converged, Stopping (t, a, f by
+    /// what follows), Fault; `.` unchanged, `x` refused. Columns as in `EVENTS`.
     const TABLE: [&str; 9] = [
         "T.xxxxx.xx.....", // Idle
         ".IAxxxx.xx.....", // Tracking

@@ -8,9 +8,10 @@ use crate::image::ImageView;
 
 /// Detects an image that repeats byte by byte while its sequence number advances.
 ///
-/// A few rows about each mark are hashed, at the marks' positions *when the content last changed*: with windows that follow
-/// the prediction, a moving arm would make a frozen image look new. The noise of a live camera changes the hash in every
-/// frame, so a run of equal hashes is a frozen image. Whether that is a fault (the arm moves) is decided by the caller.
+/// A few rows about each mark are hashed, at the marks' positions *when the content last changed*: with windows that
+/// follow the prediction, a moving arm would make a frozen image look new. The noise of a live camera changes the hash
+/// in every frame, so a run of equal hashes is a frozen image. Whether that is a fault (the arm moves) is decided by
+/// the caller.
 #[derive(Clone, Debug)]
 pub(crate) struct FreezeWatch {
     anchors: [[Option<(u16, u16)>; MAX_MARKS]; 2],

@@ -1,7 +1,7 @@
 //! The stereo pair that the tracker takes, and the checks before it is searched.
 //!
-//! The tracker makes these checks because it also runs on recordings and in tests. On frames from shared memory, the frame
-//! topic has already checked the bytes (`graspd_shm::frame::check`).
+//! The tracker makes these checks because it also runs on recordings and in tests. On frames from shared memory, the
+//! frame topic has already checked the bytes (`graspd_shm::frame::check`).
 
 use crate::geom::{Rig, View};
 use crate::image::ImageView;

@@ -1,8 +1,8 @@
 //! Interaction matrix of a mark for fixed cameras and a moving gripper (eye-to-hand).
 //!
-//! The sign of the servo is decided here and nowhere else. A point `X` fixed in the gripper moves with `v + w x X` (in the
-//! axes of the gripper frame) under the gripper's screw `xi = [v; w]`; `R`, the rotation of `camera_from_gripper`, takes it to
-//! the camera frame:
+//! The sign of the servo is decided here and nowhere else. A point `X` fixed in the gripper moves with `v + w x X` (in
+//! the axes of the gripper frame) under the gripper's screw `xi = [v; w]`; `R`, the rotation of `camera_from_gripper`,
+//! takes it to the camera frame:
 //!
 //! ```text
 //!            |1/Z   0   -x/Z|
@@ -10,8 +10,8 @@
 //!            | 0   1/Z  -y/Z|
 //! ```
 //!
-//! The sign is plus. The eye-in-hand matrix of most textbooks has a minus in front, because there the camera moves and the
-//! point is fixed. For pixels the lens is applied: `L_px = (d pixel / d normalized) L`, distortion included.
+//! The sign is plus. The eye-in-hand matrix of most textbooks has a minus in front, because there the camera moves and
+//! the point is fixed. For pixels the lens is applied: `L_px = (d pixel / d normalized) L`, distortion included.
 
 use crate::geom::{Camera, Pixel, Pose, Vec3};
 use nalgebra::{Matrix2x6, Matrix3};
@@ -50,9 +50,9 @@ impl<'a> PlacedView<'a> {
         self.camera.contains(pixel, margin)
     }
 
-    /// Pixel of a point of the gripper (metres, gripper frame), and its interaction matrix `L` (2x6, px/s per m/s and per rad/s):
-    /// `ds/dt = L xi`, where `xi` is the gripper's screw relative to the rig, at the gripper's origin, in the gripper frame. Paper
-    /// section 5; sign as above.
+    /// Pixel of a point of the gripper (metres, gripper frame), and its interaction matrix `L` (2x6, px/s per m/s and
+    /// per rad/s): `ds/dt = L xi`, where `xi` is the gripper's screw relative to the rig, at the gripper's origin, in
+    /// the gripper frame. Paper section 5; sign as above.
     ///
     /// `None` at or behind the projection centre.
     pub fn interaction(&self, x_gripper: &Vec3) -> Option<(Pixel, Matrix2x6<f64>)> {

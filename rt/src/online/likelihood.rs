@@ -1,12 +1,13 @@
-//! Likelihood of pose and rig together, in units in which all unknowns have the same size: the test for a step of the rig.
+//! Likelihood of pose and rig together, in units in which all unknowns have the same size: the test for a step of the
+//! rig.
 
 use super::rig_fit::{Joint, JointVector, RigMatrix, UNKNOWNS};
 use crate::geom::RIG_UNKNOWNS;
 use crate::math;
 use nalgebra::{Matrix6, SMatrix, SVector};
 
-/// Standard deviation of a camera move, and the unit of each unknown in this file: the entire rig by 10 mm and 0.6 degrees, one
-/// camera by 0.6 degrees, 0.5 % of focal length and 10 px.
+/// Standard deviation of a camera move, and the unit of each unknown in this file: the entire rig by 10 mm and 0.6
+/// degrees, one camera by 0.6 degrees, 0.5 % of focal length and 10 px.
 pub(super) const STEP: [f64; UNKNOWNS] =
     [1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 5e-3, 5e-3, 10.0, 10.0, 10.0, 10.0];
 /// Standard deviation of a pose without a prediction, in units of [`STEP`].
@@ -43,8 +44,8 @@ pub(super) fn scaled_vector(x: &JointVector) -> JointVector {
     JointVector::from_fn(|i, _| x[i] * STEP[i])
 }
 
-/// Gain in chi-squared when the covariance of the unknowns is `wide` instead of `narrow`, and the unknowns with `wide`. `None`
-/// if a value is not finite.
+/// Gain in chi-squared when the covariance of the unknowns is `wide` instead of `narrow`, and the unknowns with `wide`.
+/// `None` if a value is not finite.
 pub(super) fn gain<const N: usize>(
     information: &SMatrix<f64, N, N>,
     score: &SVector<f64, N>,

@@ -17,7 +17,8 @@ pub struct MarkObservation {
 /// State of the rig by the marks.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RigHealth {
-    /// Estimated offset of the rig in standard deviations of its stated error (root of the sum of squares over the unknowns).
+    /// Estimated offset of the rig in standard deviations of its stated error (root of the sum of squares over the
+    /// unknowns).
     pub offset_sigmas: f64,
     /// Encoders and images disagree as if a camera had moved; this is decided at rest.
     pub suspicious: bool,
@@ -27,6 +28,7 @@ pub struct RigHealth {
     pub shakes: u32,
     /// Error of the gripper's pose that the last change would cause, metres (unit-scaled).
     pub astray_m: f64,
-    /// Evidence of a change as a fraction of the significance limit: of a step in this frame, and of the window against the start.
+    /// Evidence of a change as a fraction of the significance limit: of a step in this frame, and of the window against
+    /// the start.
     pub evidence: [f64; 2],
 }

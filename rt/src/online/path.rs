@@ -1,9 +1,9 @@
 //! The path of the reference from the gripper's pose to the goal: planned in space, followed in the images.
 //!
-//! A reference pose moves along a leg: a straight line with a uniform rotation, or an arc about the valve's axis. The pixels
-//! of the marks at that pose are the reference features of the servo, and its velocity is the feed-forward, so the image
-//! error is always small. When the gripper lags, the reference waits. At the end of a leg the reference features are the
-//! pixels of the plan.
+//! A reference pose moves along a leg: a straight line with a uniform rotation, or an arc about the valve's axis. The
+//! pixels of the marks at that pose are the reference features of the servo, and its velocity is the feed-forward, so
+//! the image error is always small. When the gripper lags, the reference waits. At the end of a leg the reference
+//! features are the pixels of the plan.
 
 use crate::geom::{Pixel, Pose, Twist, Vec3, exp_twist, log_pose};
 use crate::math;
@@ -112,7 +112,8 @@ impl Leg {
     }
 }
 
-/// A reference that moves along a leg with bounded speed and acceleration, waits when the gripper lags, and ends at rest.
+/// A reference that moves along a leg with bounded speed and acceleration, waits when the gripper lags, and ends at
+/// rest.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reference {
     leg: Leg,
@@ -162,7 +163,8 @@ impl Reference {
         self.rate = 0.0;
     }
 
-    /// Advances by `dt_s` seconds at the fraction `scale` (0 to 1) of full speed; `lag_m` is the lag of the gripper (unit-scaled).
+    /// Advances by `dt_s` seconds at the fraction `scale` (0 to 1) of full speed; `lag_m` is the lag of the gripper
+    /// (unit-scaled).
     pub fn advance(&mut self, dt_s: f64, scale: f64, lag_m: f64, settings: &PathSettings) {
         if self.ended() || !(dt_s > 0.0 && dt_s.is_finite()) {
             self.rate = 0.0;
@@ -196,8 +198,8 @@ pub fn blend(s: f64) -> f64 {
 
 /// Reference pixel of a mark: its projection at the reference pose plus the blended offset of the plan.
 ///
-/// `from` and `to` are the differences between the plan's pixel and the projection of the plan's pose, at the start and the
-/// end of the leg. At `s = 1`, with the reference at the goal pose, the result is the plan's pixel.
+/// `from` and `to` are the differences between the plan's pixel and the projection of the plan's pose, at the start and
+/// the end of the leg. At `s = 1`, with the reference at the goal pose, the result is the plan's pixel.
 pub fn reference_pixel(projection: Pixel, from: Option<Pixel>, to: Option<Pixel>, s: f64) -> Pixel {
     let b = blend(s);
     projection + from.unwrap_or_default() * (1.0 - b) + to.unwrap_or_default() * b

@@ -1,8 +1,8 @@
 //! Prediction of the gripper's pose from the capture of an image to now, by the arm's encoders.
 //!
-//! An image is tens of milliseconds old when its marks are known. The joints give the motion of the gripper since, in its own
-//! frame; the pose of the rig relative to the robot cancels. The effect of an error in the arm model scales with that short
-//! motion and vanishes at rest, so it does not change where the servo converges.
+//! An image is tens of milliseconds old when its marks are known. The joints give the motion of the gripper since, in
+//! its own frame; the pose of the rig relative to the robot cancels. The effect of an error in the arm model scales
+//! with that short motion and vanishes at rest, so it does not change where the servo converges.
 
 use crate::arm::{Dh, Joints};
 use crate::geom::Pose;

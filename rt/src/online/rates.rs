@@ -33,8 +33,8 @@ pub struct Rates {
     pub scale: f64,
     /// Smallest singular value of the unit-scaled Jacobian, m/s per rad/s.
     pub sigma_min: f64,
-    /// The joint that moves most in the weakest direction, which is the one to move away from the singularity: 0 (base) to 5
-    /// (wrist 3).
+    /// The joint that moves most in the weakest direction, which is the one to move away from the singularity: 0 (base)
+    /// to 5 (wrist 3).
     pub joint: u8,
 }
 
@@ -52,8 +52,8 @@ pub enum RateError {
     NotFinite,
 }
 
-/// Smallest singular value of the unit-scaled body Jacobian, m/s per rad/s, and the joint that moves most in its direction;
-/// `None` if a value is not finite.
+/// Smallest singular value of the unit-scaled body Jacobian, m/s per rad/s, and the joint that moves most in its
+/// direction; `None` if a value is not finite.
 pub fn singularity(jacobian: &Matrix6<f64>, settings: &RateSettings) -> Option<(f64, u8)> {
     let mut j = *jacobian;
     for r in 3..6 {
@@ -70,10 +70,11 @@ pub fn singularity(jacobian: &Matrix6<f64>, settings: &RateSettings) -> Option<(
     Some((math::sqrt(eigen.eigenvalues[least].max(0.0)), joint as u8))
 }
 
-/// Joint rates that give the gripper screw `xi` (gripper frame; m/s, rad/s): damped least squares `J^T (J J^T + d² I)^-1 xi`.
+/// Joint rates that give the gripper screw `xi` (gripper frame; m/s, rad/s): damped least squares `J^T (J J^T + d²
+/// I)^-1 xi`.
 ///
-/// The damping grows from zero as the smallest singular value falls below the soft limit (Nakamura and Hanafusa, 1986), and
-/// all rates are scaled down towards the hard limit.
+/// The damping grows from zero as the smallest singular value falls below the soft limit (Nakamura and Hanafusa, 1986),
+/// and all rates are scaled down towards the hard limit.
 ///
 /// # Errors
 /// [`RateError::Singular`] at the hard limit; [`RateError::NotFinite`] for values that are not finite.

@@ -1,8 +1,9 @@
 //! Estimates the error of the rig together with the gripper's pose.
 //!
-//! The pose is fitted to both views with the rig of the file. The residuals are noise and the effect of the rig's error that
-//! the fitted pose has not absorbed. [`Evidence`] holds the normal equations of both, pose first, so that the pose can be
-//! eliminated (what no motion of the gripper explains) or constrained by a prediction (see [`super::rig_watch`]).
+//! The pose is fitted to both views with the rig of the file. The residuals are noise and the effect of the rig's error
+//! that the fitted pose has not absorbed. [`Evidence`] holds the normal equations of both, pose first, so that the pose
+//! can be eliminated (what no motion of the gripper explains) or constrained by a prediction (see
+//! [`super::rig_watch`]).
 
 use super::pose::{self, MarkTable, PoseEstimate, PoseSettings};
 use crate::geom::{Pose, RIG_UNKNOWNS, Rig, RigError, RigOffset, View};
@@ -41,9 +42,9 @@ pub struct Evidence {
 }
 
 impl Evidence {
-    /// Accumulates the marks of `table`. The square of `floor_px`, the error of a mark that does not average out, is added to each
-    /// covariance. With `explain`, a change of the unknowns, marks that it does not explain are weighted down. `None` if a mark
-    /// is behind a camera or a value is not finite.
+    /// Accumulates the marks of `table`. The square of `floor_px`, the error of a mark that does not average out, is
+    /// added to each covariance. With `explain`, a change of the unknowns, marks that it does not explain are weighted
+    /// down. `None` if a mark is behind a camera or a value is not finite.
     pub fn gather(
         rig: &Rig,
         gripper: &Gripper,
@@ -148,8 +149,8 @@ pub struct RigFit {
     pub offset: RigOffset,
 }
 
-/// Fits pose and rig offset; `floor_px` is the error of a mark that does not average out. Two rounds of a robust pose and a
-/// linear step of the offset, then the final pose.
+/// Fits pose and rig offset; `floor_px` is the error of a mark that does not average out. Two rounds of a robust pose
+/// and a linear step of the offset, then the final pose.
 pub fn fit(
     rig: &Rig,
     gripper: &Gripper,

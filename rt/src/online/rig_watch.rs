@@ -1,11 +1,12 @@
 //! Detects that a camera was moved; docs/HEALTH.md derives the method.
 //!
-//! A Kalman filter estimates the gripper's pose in the rig and the offset of the rig. Between two frames the pose moves by
-//! the encoders, with an uncertainty proportional to the motion; the offset is constant. The filter so learns the unknown
-//! error of the rig, and a frame is tested for a change beyond it: does a step of the rig explain this frame better than no
-//! step, by more than chance? A second test does not use the encoders: it compares what no pose explains, over a window of
-//! frames, with its value at the start. It detects steps too small for one frame, drifts, and changes while the marks were
-//! out of sight. Both tests are one function, the gain in likelihood when the unknowns may have changed.
+//! A Kalman filter estimates the gripper's pose in the rig and the offset of the rig. Between two frames the pose moves
+//! by the encoders, with an uncertainty proportional to the motion; the offset is constant. The filter so learns the
+//! unknown error of the rig, and a frame is tested for a change beyond it: does a step of the rig explain this frame
+//! better than no step, by more than chance? A second test does not use the encoders: it compares what no pose
+//! explains, over a window of frames, with its value at the start. It detects steps too small for one frame, drifts,
+//! and changes while the marks were out of sight. Both tests are one function, the gain in likelihood when the unknowns
+//! may have changed.
 //!
 //! A step makes the watch suspicious immediately, which stops the arm. Its cause is decided at rest, where encoders and
 //! images cannot disagree about a motion: a camera that was moved is still displaced then, a disturbance is over.
@@ -26,15 +27,17 @@ pub struct RigWatchSettings {
     pub rig_error: RigError,
     /// Error of a mark that does not average out over frames, pixels. Default 0.05.
     pub mark_px: f64,
-    /// Disagreement of encoders and images as a fraction of the motion between two frames: mounting, arm model, exposure times.
-    /// Default 0.03.
+    /// Disagreement of encoders and images as a fraction of the motion between two frames: mounting, arm model,
+    /// exposure times. Default 0.03.
     pub motion_share: f64,
     /// Disagreement at rest, metres (rotation: this over 0.1 m). Default 20 um.
     pub rest_m: f64,
-    /// Chi-squared by which a change must explain a frame or the window better; half of it in the frame that confirms. Default
-    /// 45: with the seven degrees of freedom of a change that marks can show, chance gives both once in 3 * 10^9 frames.
+    /// Chi-squared by which a change must explain a frame or the window better; half of it in the frame that confirms.
+    /// Default 45: with the seven degrees of freedom of a change that marks can show, chance gives both once in 3 *
+    /// 10^9 frames.
     pub significant: f64,
-    /// Error of the gripper's pose below which a significant change is only a warning, metres (unit-scaled). Default 0.0005.
+    /// Error of the gripper's pose below which a significant change is only a warning, metres (unit-scaled). Default
+    /// 0.0005.
     pub harmless_m: f64,
     /// Consecutive frames with a change that make it suspicious: a single one may be a shock. Default 2.
     pub confirm: u32,
@@ -61,15 +64,15 @@ impl Default for RigWatchSettings {
 const LEARN_FRAMES: u32 = 6;
 /// Frames after which the offset becomes the base of the window test.
 const BASE_FRAMES: u32 = 20;
-/// Fraction by which the offset's covariance returns to the stated error in each frame: 0.006 px per frame, so that the filter
-/// never claims to know the offset better than marks can be measured.
+/// Fraction by which the offset's covariance returns to the stated error in each frame: 0.006 px per frame, so that the
+/// filter never claims to know the offset better than marks can be measured.
 const FORGET: f64 = 2e-5;
 /// Time constant of the window, frames.
 const WINDOW: f64 = 60.0;
 /// Largest motion between two frames that is rest, metres (unit-scaled): 6 mm/s at 60 Hz.
 const MAX_REST_M: f64 = 1e-4;
-/// Motion since the last trusted frame beyond which the encoders can no longer clear a suspicion, metres (unit-scaled): 3 % of
-/// it are 0.6 mm.
+/// Motion since the last trusted frame beyond which the encoders can no longer clear a suspicion, metres (unit-scaled):
+/// 3 % of it are 0.6 mm.
 const MAX_UNDECIDED_M: f64 = 0.02;
 /// Largest motion of an arm between two frames, metres (unit-scaled): beyond it the encoders have jumped.
 const MAX_MOTION_M: f64 = 0.1;
@@ -149,8 +152,9 @@ impl RigWatch {
         self.health
     }
 
-    /// Takes the marks of one pair, the pose `fitted` to them in the rig of the file, and the gripper's pose in the robot's base
-    /// by the encoders at capture. Bounded work: three passes over at most 64 marks, a few systems of 15 unknowns.
+    /// Takes the marks of one pair, the pose `fitted` to them in the rig of the file, and the gripper's pose in the
+    /// robot's base by the encoders at capture. Bounded work: three passes over at most 64 marks, a few systems of 15
+    /// unknowns.
     pub fn update(
         &mut self,
         rig: &Rig,

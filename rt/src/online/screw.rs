@@ -1,8 +1,8 @@
 //! The control law: from the marks' errors in the images to the correction of the gripper's pose (paper section 5).
 //!
-//! The interaction matrices of all marks in the views in use are stacked: four rows per mark in stereo, two in one view. The
-//! stack is not stored: each mark is added to the weighted normal equations, so that 32 marks in two views cost 64 small
-//! products and one 6x6 solve.
+//! The interaction matrices of all marks in the views in use are stacked: four rows per mark in stereo, two in one
+//! view. The stack is not stored: each mark is added to the weighted normal equations, so that 32 marks in two views
+//! cost 64 small products and one 6x6 solve.
 
 use super::interaction::PlacedView;
 use crate::geom::{Pixel, Twist, Vec3, View};
@@ -54,17 +54,18 @@ pub struct LawSettings {
     pub views: ViewMode,
     /// Evaluation of the interaction matrix. Default: mean.
     pub jacobian: JacobianAt,
-    /// Gain close to the reference, 1/s. Default 2.5; above about 5 the loop oscillates with a camera delay of 30 ms and a poor
-    /// arm model.
+    /// Gain close to the reference, 1/s. Default 2.5; above about 5 the loop oscillates with a camera delay of 30 ms
+    /// and a poor arm model.
     pub gain_near_per_s: f64,
     /// Gain far from the reference, 1/s. Default 1.0.
     pub gain_far_per_s: f64,
     /// Correction (unit-scaled length) at which the gain is halfway between, metres. Default 0.02.
     pub gain_knee_m: f64,
-    /// Length that makes a rotation comparable with a translation: 1 rad counts as this many metres. Default 0.1, the size of a
-    /// gripper.
+    /// Length that makes a rotation comparable with a translation: 1 rad counts as this many metres. Default 0.1, the
+    /// size of a gripper.
     pub length_m: f64,
-    /// Damping of the least squares as a singular value, pixels (rms) per metre. Default 2; usual stacks have 30 to 800.
+    /// Damping of the least squares as a singular value, pixels (rms) per metre. Default 2; usual stacks have 30 to
+    /// 800.
     pub damping_px_per_m: f64,
     /// Smallest singular value with which the arm may move, pixels (rms) per metre. Default 6.
     pub min_sigma_px_per_m: f64,
@@ -101,7 +102,8 @@ impl LawSettings {
         self.gain_far_per_s + (self.gain_near_per_s - self.gain_far_per_s) * math::exp(-core::f64::consts::LN_2 * x)
     }
 
-    /// Unit-scaled length of a small gripper motion, metres: the root of the squares of translation and `length_m` times rotation.
+    /// Unit-scaled length of a small gripper motion, metres: the root of the squares of translation and `length_m`
+    /// times rotation.
     pub fn size(&self, xi: &Twist) -> f64 {
         let l2 = math::sq(self.length_m);
         let (t, r) = (xi.fixed_rows::<3>(0).norm_squared(), xi.fixed_rows::<3>(3).norm_squared());
@@ -112,12 +114,13 @@ impl LawSettings {
 /// Solution of the stack.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Screw {
-    /// Small gripper motion `[v; ω]` (m, rad) in the gripper frame that brings the marks onto the reference, by damped weighted
-    /// least squares.
+    /// Small gripper motion `[v; ω]` (m, rad) in the gripper frame that brings the marks onto the reference, by damped
+    /// weighted least squares.
     pub correction: Twist,
     /// Root mean square distance of the marks from the reference, pixels per coordinate.
     pub error_px: f64,
-    /// Part of `error_px` that no motion can remove, pixels: noise and calibration error. At rest it shows the health of the rig.
+    /// Part of `error_px` that no motion can remove, pixels: noise and calibration error. At rest it shows the health
+    /// of the rig.
     pub residual_px: f64,
     /// Standard deviation of the correction's translation by the marks' covariances, metres.
     pub sigma_m: f64,
@@ -191,8 +194,9 @@ impl Stack {
         }
     }
 
-    /// Adds the mark at `x_gripper` (gripper frame, metres) of one view, with the gripper at its current pose (`current`) and at the
-    /// reference pose (`reference`). A mark that cannot be projected, or with values that are not finite, adds nothing.
+    /// Adds the mark at `x_gripper` (gripper frame, metres) of one view, with the gripper at its current pose
+    /// (`current`) and at the reference pose (`reference`). A mark that cannot be projected, or with values that are
+    /// not finite, adds nothing.
     pub fn add(&mut self, current: &PlacedView, reference: &PlacedView, x_gripper: &Vec3, mark: &MarkError) {
         let l = match self.settings.jacobian {
             JacobianAt::Current => current.interaction(x_gripper).map(|(_, l)| l),
@@ -233,7 +237,8 @@ impl Stack {
         if self.points < s.min_points {
             return Err(ScrewError::TooFewPoints { points: self.points, needed: s.min_points });
         }
-        // Divided by the total weight, the matrix is the mean square motion of the pixels per unit of unit-scaled motion.
+        // Divided by the total weight, the matrix is the mean square motion of the pixels per unit of unit-scaled
+        // motion.
         let h = self.h / self.weight;
         let g = self.g / self.weight;
         if h.iter().chain(g.iter()).any(|v| !v.is_finite()) {

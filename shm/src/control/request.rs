@@ -68,7 +68,8 @@ pub struct RequestHeader {
     pub verb: u32,
     /// Bytes of the payload in use; the rest is padding.
     pub length: u32,
-    /// Time of the request, CLOCK_MONOTONIC nanoseconds. Verbs that may lead to motion are refused when older than 250 ms.
+    /// Time of the request, CLOCK_MONOTONIC nanoseconds. Verbs that may lead to motion are refused when older than 250
+    /// ms.
     pub stamp_ns: u64,
 }
 

@@ -40,8 +40,8 @@ pub struct TelemetrySample {
     pub state: u32,
     /// Number of the latched fault: that of its code, F-ARM-05 is 405; 0 none.
     pub fault: u32,
-    /// Part of the task: 0 none, 1 to the pre-grasp, 2 to the grasp, 3 holding on the goal (gripper motion included), 5 turn,
-    /// 6 retreat; 4 is unused.
+    /// Part of the task: 0 none, 1 to the pre-grasp, 2 to the grasp, 3 holding on the goal (gripper motion included), 5
+    /// turn, 6 retreat; 4 is unused.
     pub phase: u32,
     /// 0 stereo, 1 left, 2 right, 3 best.
     pub views: u32,
@@ -73,9 +73,11 @@ pub struct TelemetrySample {
     pub command: [f64; 6],
     /// Commanded screw in the gripper frame, m/s and rad/s.
     pub screw: [f64; 6],
-    /// Gripper pose in the frame of the left camera: x, y, z (m), then quaternion w, x, y, z; NaN before the marks were seen.
+    /// Gripper pose in the frame of the left camera: x, y, z (m), then quaternion w, x, y, z; NaN before the marks were
+    /// seen.
     pub left_from_gripper: [f64; 7],
-    /// Root mean square distance of the marks from the moving reference, px per coordinate; NaN while the law does not drive.
+    /// Root mean square distance of the marks from the moving reference, px per coordinate; NaN while the law does not
+    /// drive.
     pub error_px: f64,
     /// Part of `error_px` that no motion can remove, px: noise and calibration error; NaN while the law does not drive.
     pub residual_px: f64,

@@ -1,8 +1,9 @@
-//! Checks a sample from its bytes to a pair of images that may be read. Nothing in a header is used before it was checked.
+//! Checks a sample from its bytes to a pair of images that may be read. Nothing in a header is used before it was
+//! checked.
 //!
-//! These checks protect the reader from the publisher: layout, bounds, identities, plausible stamps. The tracker repeats the
-//! checks of size, stamps and order (`graspd_rt::online::FrameReject`), because it also runs on recordings and in tests,
-//! where no frame topic was in front of it.
+//! These checks protect the reader from the publisher: layout, bounds, identities, plausible stamps. The tracker
+//! repeats the checks of size, stamps and order (`graspd_rt::online::FrameReject`), because it also runs on recordings
+//! and in tests, where no frame topic was in front of it.
 
 use super::header::{LAYOUT_VERSION, MAGIC, StereoHeader, flags};
 use super::{FrameError, PixelFormat, format};
@@ -42,8 +43,8 @@ impl Default for FramePolicy {
 
 /// A checked stereo pair, borrowed from shared memory.
 ///
-/// The header is the reader's own copy, made before the checks: a publisher that writes afterwards can change pixels, but
-/// not sizes.
+/// The header is the reader's own copy, made before the checks: a publisher that writes afterwards can change pixels,
+/// but not sizes.
 #[derive(Clone, Copy, Debug)]
 pub struct StereoSample<'a> {
     header: StereoHeader,
@@ -187,8 +188,8 @@ impl<'a> StereoSample<'a> {
         format::to_mono8(self.format, self.bytes(view), self.width(), self.height(), self.stride(), out)
     }
 
-    /// A hash of every 61st byte of each image, about 43 000 bytes of a pair of 1280 x 1024. Noise changes every real image,
-    /// so a hash that repeats over several pairs means a frozen camera.
+    /// A hash of every 61st byte of each image, about 43 000 bytes of a pair of 1280 x 1024. Noise changes every real
+    /// image, so a hash that repeats over several pairs means a frozen camera.
     pub fn fingerprint(&self) -> [u64; 2] {
         self.images.map(|image| {
             image

@@ -8,8 +8,8 @@ pub enum PixelFormat {
     Mono8 = 1,
     /// 12 bits in a 16-bit word, native byte order, value 0 to 4095.
     Mono12 = 2,
-    /// Two pixels in three bytes (GigE Vision `Mono12Packed`): the high 8 bits of the first; the low 4 bits of both, those of
-    /// the first in the low nibble; the high 8 bits of the second.
+    /// Two pixels in three bytes (GigE Vision `Mono12Packed`): the high 8 bits of the first; the low 4 bits of both,
+    /// those of the first in the low nibble; the high 8 bits of the second.
     Mono12Packed = 3,
     /// 16 bits per pixel, native byte order.
     Mono16 = 4,
@@ -57,11 +57,11 @@ impl PixelFormat {
     }
 }
 
-/// Converts one image to 8-bit grey, `width * height` bytes without padding. Does not allocate. Returns `false` when `data` or
-/// `out` is too short.
+/// Converts one image to 8-bit grey, `width * height` bytes without padding. Does not allocate. Returns `false` when
+/// `data` or `out` is too short.
 ///
-/// A Bayer mosaic is filtered with the kernel 1-2-1 along both axes. At every pixel, whatever its colour, this weighs red 1/4,
-/// green 1/2 and blue 1/4, so that the four orders give the same grey and no edge shifts by half a pixel.
+/// A Bayer mosaic is filtered with the kernel 1-2-1 along both axes. At every pixel, whatever its colour, this weighs
+/// red 1/4, green 1/2 and blue 1/4, so that the four orders give the same grey and no edge shifts by half a pixel.
 pub(crate) fn to_mono8(
     format: PixelFormat,
     data: &[u8],

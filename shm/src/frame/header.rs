@@ -50,8 +50,8 @@ pub struct StereoHeader {
     pub flags: u32,
     /// [`id_hash`] of each camera's serial number; 0 means unknown.
     pub camera_id: [u64; 2],
-    /// Identity of the rig file that the publisher was set up with: the first eight bytes of its content hash as a big-endian
-    /// number; 0 means unknown.
+    /// Identity of the rig file that the publisher was set up with: the first eight bytes of its content hash as a
+    /// big-endian number; 0 means unknown.
     pub calibration_id: u64,
     /// Pairs that the publisher has dropped since it started.
     pub dropped: u64,

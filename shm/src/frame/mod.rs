@@ -1,7 +1,8 @@
 //! The stereo frame topic: one sample is one pair of images behind a fixed-layout header.
 //!
-//! [`FramePublisher`] is the camera driver's half, [`FrameSubscriber`] the reader's. `header` and `format` hold the layout,
-//! `qos` the quality of service, and `check` everything that a reader demands of a sample before it reads a pixel.
+//! [`FramePublisher`] is the camera driver's half, [`FrameSubscriber`] the reader's. `header` and `format` hold the
+//! layout, `qos` the quality of service, and `check` everything that a reader demands of a sample before it reads a
+//! pixel.
 //!
 //! ```
 //! use graspd_shm::frame::{FrameGeometry, FramePolicy, FramePublisher, FrameStamp, FrameSubscriber, PixelFormat};

@@ -100,8 +100,8 @@ impl FramePublisher {
         Ok(Self { publisher, geometry, template, sequence: 0 })
     }
 
-    /// States the cameras' identities ([`super::id_hash`]), the identity of the driver's calibration, and the source of the
-    /// capture stamps. The default is unknown.
+    /// States the cameras' identities ([`super::id_hash`]), the identity of the driver's calibration, and the source of
+    /// the capture stamps. The default is unknown.
     pub fn identify(&mut self, cameras: [u64; 2], calibration: u64, clock: ClockSource) {
         self.template.camera_id = cameras;
         self.template.calibration_id = calibration;

@@ -6,8 +6,8 @@ use crate::{Ipc, ShmError, ShmNode};
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::sample::Sample;
 
-/// Most samples taken in one call: twice what the topic can hold for two publishers, so that a flood of samples cannot keep
-/// the reader busy.
+/// Most samples taken in one call: twice what the topic can hold for two publishers, so that a flood of samples cannot
+/// keep the reader busy.
 const DRAIN_CAP: usize = 8;
 
 /// Counters since the subscriber was made.
@@ -46,8 +46,8 @@ impl FrameStats {
 pub enum SourceEvent {
     /// The first publisher has sent a good frame.
     First,
-    /// The publisher was silent for [`FramePolicy::takeover_ns`] and another one took its place: the marks must be acquired
-    /// again.
+    /// The publisher was silent for [`FramePolicy::takeover_ns`] and another one took its place: the marks must be
+    /// acquired again.
     TakenOver,
     /// A second publisher sends while the first one is alive; its frames are refused.
     SecondPublisher,
@@ -72,8 +72,8 @@ pub struct Received<'a> {
 
 /// Reads the cell's frame topic.
 ///
-/// [`Self::newest`] does not allocate, except when a publisher comes or goes: iceoryx2 then maps or unmaps its segment, which
-/// takes tens of milliseconds with locked memory. The command thread must therefore not call it.
+/// [`Self::newest`] does not allocate, except when a publisher comes or goes: iceoryx2 then maps or unmaps its segment,
+/// which takes tens of milliseconds with locked memory. The command thread must therefore not call it.
 ///
 /// Not `Send`: create it on the thread that reads.
 #[derive(Debug)]
@@ -162,8 +162,8 @@ impl FrameSubscriber {
             }
         }
         if let Some(sample) = &self.held {
-            // Checked again here, because the publisher can still write to the sample: what is returned is a checked copy of
-            // the header.
+            // Checked again here, because the publisher can still write to the sample: what is returned is a checked
+            // copy of the header.
             if let Ok(frame) = check(sample.user_header(), sample.payload(), &self.policy, now_ns) {
                 let sequence = frame.sequence();
                 out.skipped = self.delivered.map_or(0, |d| sequence.saturating_sub(d + 1));

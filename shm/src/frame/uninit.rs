@@ -11,8 +11,8 @@ pub(super) type Loaned = SampleMut<ipc::Service, [u8], StereoHeader>;
 
 /// Declares a fresh loan initialised, which saves writing 2.6 MB of zeros that the caller overwrites anyway.
 pub(super) fn assume_bytes(loan: SampleMutUninit<ipc::Service, [MaybeUninit<u8>], StereoHeader>) -> Loaned {
-    // SAFETY: the payload is in a shared-memory object made with ftruncate and mmap: the kernel hands it out zeroed, and
-    // since then only the bytes of earlier samples were written to it. So every byte is initialised memory, and every bit
-    // pattern is a valid `u8`. iceoryx2 wrote the user header with `Default` when it loaned the sample.
+    // SAFETY: the payload is in a shared-memory object made with ftruncate and mmap: the kernel hands it out zeroed,
+    // and since then only the bytes of earlier samples were written to it. So every byte is initialised memory, and
+    // every bit pattern is a valid `u8`. iceoryx2 wrote the user header with `Default` when it loaned the sample.
     unsafe { loan.assume_init() }
 }
