@@ -1,6 +1,7 @@
 //! The modes of the loop, and the table of transitions between them.
 
 mod fault;
+mod fault_text;
 mod hold;
 mod reject;
 
