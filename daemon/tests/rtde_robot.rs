@@ -151,7 +151,7 @@ fn held_and_unknown_variables_are_named_with_their_likely_owner() {
     mock.ask(&Command::ClearFaults).unwrap();
     mock.ask(&Command::WrongType { names: vec!["actual_q".into()] }).unwrap();
     let text = UrLink::connect(&config).unwrap_err().to_string();
-    assert!(text.contains("`actual_q` is DOUBLE on this controller, VECTOR6D was expected"), "{text}");
+    assert!(text.contains("`actual_q` has type DOUBLE on this controller, expected VECTOR6D"), "{text}");
 }
 
 #[test]

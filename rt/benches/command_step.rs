@@ -1,6 +1,7 @@
-//! Time of one cycle of the command cycle while it drives: 8 marks in two views, 500 Hz, in lock step with the simulated world.
+//! Duration of a cycle of the command thread while it drives: 8 marks in two views, 500 Hz, in lock step with the
+//! simulated world.
 //!
-//! Prints percentiles; nothing passes or fails by them. `cargo bench -p graspd-rt --bench command_step`
+//! Prints percentiles; a benchmark, not a test. `cargo bench -p graspd-rt --bench command_step`
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 #[path = "../tests/closed_loop/heap.rs"]

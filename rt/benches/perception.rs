@@ -1,7 +1,7 @@
-//! Times of the vision thread's parts on a rendered pair with sixteen marks: best, median and 99 % of repeated runs (on a shared
-//! machine the best is the program's, the rest the neighbours').
+//! Durations of the parts of the vision thread on a rendered pair with sixteen marks: minimum, median and 99th
+//! percentile of repeated runs (on a shared machine the minimum is the most reproducible).
 //!
-//! `cargo bench -p graspd-rt --bench perception`. Figures, not a test: nothing fails here for being slow.
+//! `cargo bench -p graspd-rt --bench perception`. A benchmark, not a test.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 #[path = "../tests/support/mod.rs"]
@@ -87,7 +87,7 @@ fn main() {
         });
     }
 
-    // The most work an image can make: noise of full contrast in every window.
+    // The most expensive image: noise of full contrast in every window.
     let mut busy = Pair { left: pair.left.clone(), right: pair.right.clone(), width: pair.width, height: pair.height };
     for b in busy.left.iter_mut().chain(busy.right.iter_mut()) {
         *b = random.bits() as u8;
@@ -112,7 +112,7 @@ fn main() {
     report("acquisition on white noise", 10, || {
         let _ = black_box(acquire(&rig, &gripper, &l, &r, &wanted, &mut scratch));
     });
-    // Thirty-two other discs of the marks' own size, all in both views.
+    // Thirty-two other discs of the size of the marks, all in both views.
     let mut crowd = heapless::Vec::new();
     for _ in 0..32 {
         let position = nalgebra::Vector3::new(

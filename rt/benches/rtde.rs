@@ -1,5 +1,5 @@
-//! What a package costs: `cargo bench -p graspd-rt --bench rtde`. Prints the best and the median of many batches, ns each, and
-//! the allocations (none are possible in this crate; the counter proves it for the whole path).
+//! Duration of reading and writing a package: `cargo bench -p graspd-rt --bench rtde`. Prints minimum and median of
+//! many batches, ns per package, and the number of allocations, which is zero.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -49,7 +49,7 @@ const TYPICAL: &str = "timestamp,actual_q,actual_qd,target_q,target_qd,robot_mod
 output_int_register_24,output_double_register_24,output_double_register_25,output_double_register_26,\
 output_double_register_27,output_double_register_28,output_double_register_29";
 
-/// One stream of a single data package, and what reads it.
+/// A stream of one data package, and its reader.
 fn data(recipe: &Recipe<64>) -> Vec<u8> {
     let values: Vec<u8> = (0..recipe.size()).map(|i| (i % 63) as u8).collect();
     let mut bytes = vec![0u8; 1024];
@@ -88,9 +88,9 @@ fn main() {
         }
     });
 
-    let ours = Recipe::<64>::resolve(Side::Output, &STATE_FIELDS).unwrap();
-    let bytes = data(&ours);
-    let reader = StateReader::new(&ours).unwrap();
+    let recipe = Recipe::<64>::resolve(Side::Output, &STATE_FIELDS).unwrap();
+    let bytes = data(&recipe);
+    let reader = StateReader::new(&recipe).unwrap();
     measure("frame, parse and read our 17 fields into RobotState", || {
         framer.feed(black_box(&bytes));
         let package = framer.next().unwrap().unwrap();

@@ -1,30 +1,30 @@
-//! The gripper as the loop sees it: round marks in the gripper frame, and where the gripper sits on the flange.
+//! The gripper: round marks in the gripper frame, and its pose on the flange.
 //!
 //! The gripper frame has its origin between the finger tips, z along the approach, x along the closing direction.
 
 use crate::geom::{Pose, Vec3};
 
-/// The largest number of marks a gripper may carry.
+/// Largest number of marks of a gripper.
 pub const MAX_MARKS: usize = 32;
 
-/// One round flat mark.
+/// A flat round mark.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mark {
     /// Centre in the gripper frame, metres.
     pub position: Vec3,
-    /// Outward unit normal in the gripper frame.
+    /// Outward unit normal, gripper frame.
     pub normal: Vec3,
     /// Radius of the disc, metres.
     pub radius: f64,
-    /// Whether the disc is darker than what surrounds it.
+    /// Whether the disc is darker than its surroundings.
     pub dark: bool,
 }
 
 /// The marks of a gripper, and its mounting.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Gripper {
-    /// The marks, in the order of the gripper file; this order is their identity everywhere.
+    /// The marks, in the order of the gripper file; the index identifies a mark everywhere.
     pub marks: heapless::Vec<Mark, MAX_MARKS>,
-    /// Maps gripper coordinates into the flange's.
+    /// Pose of the gripper in the flange frame.
     pub flange_from_gripper: Pose,
 }

@@ -1,8 +1,8 @@
-//! A borrowed grey image.
+//! A borrowed 8-bit grey image.
 
 pub mod convert;
 
-/// One view of a stereo pair: mono8 rows of `stride` bytes, borrowed from wherever the camera put them.
+/// A mono8 image: rows of `stride` bytes, borrowed from the camera's buffer.
 #[derive(Clone, Copy, Debug)]
 pub struct ImageView<'a> {
     data: &'a [u8],
@@ -12,7 +12,7 @@ pub struct ImageView<'a> {
 }
 
 impl<'a> ImageView<'a> {
-    /// Borrows an image; `None` when the buffer is shorter than the last pixel needs, or a size is zero or absurd.
+    /// Borrows an image; `None` if the buffer is too short, or a side is zero or above 65 535 pixels.
     pub fn new(data: &'a [u8], width: usize, height: usize, stride: usize) -> Option<Self> {
         if width == 0 || height == 0 || width > 65_535 || height > 65_535 || stride < width {
             return None;
@@ -31,7 +31,7 @@ impl<'a> ImageView<'a> {
         self.height
     }
 
-    /// Row `y` as bytes; empty when outside.
+    /// Row `y` as bytes; empty outside the image.
     #[inline]
     pub fn row(&self, y: usize) -> &'a [u8] {
         if y >= self.height {
@@ -41,23 +41,23 @@ impl<'a> ImageView<'a> {
         self.data.get(o..o + self.width).unwrap_or(&[])
     }
 
-    /// Grey value at (x, y); 0 when outside.
+    /// Grey value at (x, y); 0 outside the image.
     #[inline]
     pub fn at(&self, x: usize, y: usize) -> u8 {
         self.row(y).get(x).copied().unwrap_or(0)
     }
 
-    /// Grey values along a straight line, bilinear: `out[i]` is taken at `(x + i dx, y + i dy)`.
+    /// Grey values along a straight line by bilinear interpolation: `out[i]` at `(x + i dx, y + i dy)`, pixels.
     ///
-    /// False, with `out` undefined, unless every sample has all four neighbours inside (NaN is outside). Positions are rounded
-    /// to 2^-16 px, which lets the inner loop do without a float to integer conversion.
+    /// `false`, with `out` undefined, unless all four neighbours of every sample are inside (NaN is outside). Positions
+    /// are rounded to 2^-16 px, which avoids a conversion from float to integer in the inner loop.
     pub fn profile(&self, x: f64, y: f64, dx: f64, dy: f64, out: &mut [f64]) -> bool {
         const ONE: f64 = 65_536.0;
-        // Rounding down may take a position below its true value by one unit; it must not fall below zero.
-        const LEAST: f64 = 2.0 / ONE;
+        // Rounding down may lower a position by one unit; it must not fall below zero.
+        const MIN_PX: f64 = 2.0 / ONE;
         let n = out.len().saturating_sub(1) as f64;
         let (right, bottom) = ((self.width - 1) as f64, (self.height - 1) as f64);
-        let inside = |x: f64, y: f64| x >= LEAST && y >= LEAST && x < right && y < bottom;
+        let inside = |x: f64, y: f64| x >= MIN_PX && y >= MIN_PX && x < right && y < bottom;
         if !(inside(x, y) && inside(x + n * dx, y + n * dy)) {
             return false;
         }
@@ -86,7 +86,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_profile_interpolates_and_keeps_inside() {
+    fn a_profile_interpolates_and_stays_inside() {
         // A plane is reproduced exactly by bilinear interpolation.
         let mut data = [0_u8; 20 * 12];
         for (i, v) in data.iter_mut().enumerate() {
@@ -108,7 +108,7 @@ mod tests {
         ] {
             assert!(!view.profile(x, y, dx, dy, &mut out), "{x} {y} {dx} {dy}");
         }
-        // Towards the upper left border, in steps that rounding shortens or lengthens: inside or refused, never below zero.
+        // Towards the upper left border in steps that rounding changes: inside or refused, never below zero.
         for k in 0..4000 {
             let (x, d) = (4.0 + f64::from(k) * 3.7e-6, -0.5 + f64::from(k % 7) * 1e-6);
             view.profile(x, x, d, d, &mut out);

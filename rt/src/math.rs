@@ -1,4 +1,4 @@
-//! Scalar functions for a crate without `std`, from one library on every platform so that a replay is exact to the bit.
+//! Scalar functions without `std`, from one library on every platform, so that a replay is exact to the bit.
 
 pub use libm::{acos, asin, atan, atan2, ceil, cos, exp, fabs, floor, fmod, hypot, log, pow, round, sin, sqrt, tan};
 

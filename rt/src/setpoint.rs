@@ -1,18 +1,20 @@
-//! The only value that crosses from the off-line to the on-line stage: where the marks have to be in both images.
+//! The set-point, the only value that the off-line stage passes to the on-line stage: the pixels of the marks at the
+//! goal.
 
 use crate::geom::{Pixel, Pose, Vec3};
 use crate::gripper::MAX_MARKS;
 
-/// A gripper pose to be reached, as the paper means it: the predicted images of the marks.
+/// A pose to be reached, given as in the paper by the predicted pixels of the marks.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Goal {
-    /// Gripper pose in the rig at the goal. It gives depths and the path; the loop is closed on `marks`.
+    /// Gripper pose in the rig at the goal. It gives depths and path; the loop is closed on `marks`.
     pub left_from_gripper: Pose,
-    /// Predicted pixel of each mark's centre by view and mark index (distorted pixels); `None` where it would not be seen.
+    /// Predicted pixel of each mark's centre by view and mark index, with lens distortion; `None` where it would not be
+    /// seen.
     pub marks: [[Option<Pixel>; MAX_MARKS]; 2],
 }
 
-/// A set-point: pre-grasp and grasp, in the order in which they are reached.
+/// A set-point: pre-grasp and grasp.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SetPoint {
     /// Identity: the first eight bytes of the plan file's content hash.
@@ -25,6 +27,6 @@ pub struct SetPoint {
     pub object_centre: Vec3,
     /// Unit normal of its plane towards the cameras: the valve's axis.
     pub object_normal: Vec3,
-    /// The view the paper's monocular mode should use: the one that sees the marks best.
+    /// The view for the paper's monocular mode: the one that shows the marks best.
     pub best_view: crate::geom::View,
 }

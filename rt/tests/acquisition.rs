@@ -1,4 +1,4 @@
-//! Acquisition from nothing: random poses among clutter, missing marks, and the cases in which the only right answer is a refusal.
+//! Acquisition without an earlier pose: random poses in clutter, missing marks, and cases that must be refused.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod support;
@@ -21,7 +21,8 @@ fn scratch() -> Box<AcquireScratch> {
     Box::new(AcquireScratch::new())
 }
 
-/// Discs in space that are no marks of ours, of the same kind and size, seen by both cameras: the worst clutter there is.
+/// Discs in space that are not marks of the gripper, of the same kind and size, visible to both cameras: the worst
+/// clutter.
 fn clutter(random: &mut Random, n: usize) -> Gripper {
     let mut marks = heapless::Vec::new();
     for _ in 0..n {
@@ -106,13 +107,13 @@ fn a_gripper_alone_is_always_found() {
 }
 
 #[test]
-fn among_tens_of_other_discs_it_is_found_and_never_wrongly() {
+fn among_tens_of_other_discs_it_is_found_and_never_wrong() {
     let (found, wrong) = many(90, 2, 24, 20, 2);
     assert!(found >= 88 && wrong == 0, "{found} found, {wrong} wrong");
 }
 
 #[test]
-fn with_half_of_the_marks_hidden_it_is_mostly_found_and_never_wrongly() {
+fn with_half_of_the_marks_hidden_it_is_mostly_found_and_never_wrong() {
     let (found, wrong) = many(40, 3, 16, 10, 9);
     assert!(found >= 38 && wrong == 0, "{found} found, {wrong} wrong");
 }
@@ -126,7 +127,7 @@ fn small_and_large_marks_are_found_alike() {
     let none = Gripper { marks: heapless::Vec::new(), flange_from_gripper: Pose::identity() };
     for z in [3.6, 2.2, 0.9, 0.6] {
         for n in 0..5 {
-            // Near by, the two views share only what is half way between the cameras.
+            // At close range the two views overlap only midway between the cameras.
             let mut truth = pose_at(&mut random, 0.4, z);
             if z < 1.0 {
                 truth.translation.vector.x = 0.25;
@@ -142,7 +143,7 @@ fn small_and_large_marks_are_found_alike() {
 
 #[test]
 fn a_rig_that_was_knocked_is_still_enough_to_find_the_gripper() {
-    // Focal length wrong by 0.5 %, relative rotation by 0.1 degrees: what product.md wants survived.
+    // Focal length off by 0.5 %, relative rotation by 0.1 degrees: the calibration error that graspd must tolerate.
     let (true_rig, gripper) = (rig(true), gripper());
     let mut scratch = scratch();
     let mut random = Random(9);
@@ -167,31 +168,32 @@ fn a_rig_that_was_knocked_is_still_enough_to_find_the_gripper() {
     }
 }
 
-/// A rig drawn from the default prior, `by` times its deviations: what an unstated calibration may be off by.
+/// A rig drawn from the default prior, with `by` times its standard deviations.
 fn drawn(random: &mut Random, rig: &Rig, by: f64) -> Rig {
     rig.offset(&RigError::default().scaled(by).deviations().map(|d| d * random.normal()))
 }
 
-/// Every rig within the stated error serves: found, tracked at once with nearly all marks, and said how far off it seems.
+/// With every rig within the stated error the gripper is found and tracked with nearly all marks, and the offset is
+/// reported.
 #[test]
-fn a_rig_that_is_off_within_its_stated_error_is_served() {
-    let (believed, gripper) = (rig(true), gripper());
+fn a_rig_within_its_stated_error_is_accepted() {
+    let (nominal, gripper) = (rig(true), gripper());
     let mut scratch = scratch();
     let mut random = Random(21);
     let (mut worst, mut largest) = (0.0_f64, 0.0_f64);
     let scenes = 60;
     for n in 0..scenes {
-        let truth_rig = drawn(&mut random, &believed, 1.0);
+        let truth_rig = drawn(&mut random, &nominal, 1.0);
         let truth = pose(&mut random, 0.5);
         let others = clutter(&mut random, 12);
         let pair = scene(&mut random, &truth_rig, &gripper, &truth, &others, &[], 10);
-        let a = run(&believed, &gripper, &pair, &mut scratch).unwrap_or_else(|e| panic!("scene {n}: {e:?}"));
-        // What the rig's error makes of a pose: a pixel of disparity is 4 mm here.
+        let a = run(&nominal, &gripper, &pair, &mut scratch).unwrap_or_else(|e| panic!("scene {n}: {e:?}"));
+        // Effect of the rig's error on the pose: a pixel of disparity is 4 mm here.
         let (mm, deg) = error(&truth, &a.left_from_gripper);
         assert!(mm < 60.0 && deg < 4.0, "scene {n}: {mm} mm {deg} deg");
         assert!(a.inner_residual_px < 0.2, "scene {n}: {} px with the rig's offset taken out", a.inner_residual_px);
         assert!(a.rig_sigmas < 5.0, "scene {n}: a rig {} of its deviations off", a.rig_sigmas);
-        let mut cycle = VisionCycle::new(believed, gripper.clone(), VisionSettings::default());
+        let mut cycle = VisionCycle::new(nominal, gripper.clone(), VisionSettings::default());
         cycle.seed(a.left_from_gripper);
         let v = cycle.step(&pair.frame(1), None).unwrap();
         assert_eq!(v.status, VisionStatus::Tracking, "scene {n}: {} px", v.residual_px);
@@ -203,34 +205,34 @@ fn a_rig_that_is_off_within_its_stated_error_is_served() {
     assert!(worst > 1.5, "these rigs are ones that a gate of 1.5 px refused: {worst}");
 }
 
-/// The wider gates are no licence: another gripper is refused, with the right rig and with one that is off.
+/// Another gripper is refused, with a perfect rig and with one within its stated error.
 #[test]
-fn another_gripper_is_refused_whatever_the_rig() {
-    let (believed, ours) = (rig(true), gripper());
+fn another_gripper_is_refused_with_any_rig() {
+    let (nominal, original) = (rig(true), gripper());
     let mut scratch = scratch();
     let mut random = Random(22);
     let mut refused = 0;
     for n in 0..60 {
-        let mut theirs = ours.clone();
+        let mut other = original.clone();
         match n % 3 {
-            // Every mark elsewhere by about a centimetre.
-            0 => theirs.marks.iter_mut().for_each(|m| {
+            // Every mark displaced by about a centimetre.
+            0 => other.marks.iter_mut().for_each(|m| {
                 let d = random.direction() * random.range(0.006, 0.016);
                 m.position += Vec3::new(d.x, d.y, 0.3 * d.z);
             }),
-            // The same, seen in a mirror.
-            1 => theirs.marks.iter_mut().for_each(|m| {
+            // The mirror image.
+            1 => other.marks.iter_mut().for_each(|m| {
                 m.position.x = -m.position.x;
                 m.normal.x = -m.normal.x;
             }),
-            // The next size of the series.
-            _ => theirs.marks.iter_mut().for_each(|m| m.position *= 1.1),
+            // Another size of the same layout.
+            _ => other.marks.iter_mut().for_each(|m| m.position *= 1.1),
         }
-        let truth_rig = drawn(&mut random, &believed, if n % 2 == 0 { 1.0 } else { 0.0 });
+        let truth_rig = drawn(&mut random, &nominal, if n % 2 == 0 { 1.0 } else { 0.0 });
         let truth = pose(&mut random, 0.5);
         let others = clutter(&mut random, 8);
-        let pair = scene(&mut random, &truth_rig, &theirs, &truth, &others, &[], 8);
-        let a = run(&believed, &ours, &pair, &mut scratch);
+        let pair = scene(&mut random, &truth_rig, &other, &truth, &others, &[], 8);
+        let a = run(&nominal, &original, &pair, &mut scratch);
         match &a {
             Ok(a) => println!("scene {n}: {:?} {} {} {}", a.seen, a.residual_px, a.inner_residual_px, a.rig_sigmas),
             Err(e) => {
@@ -283,7 +285,7 @@ fn clutter_alone_is_not_a_gripper() {
 }
 
 #[test]
-fn what_is_acquired_is_tracked_at_once() {
+fn an_acquired_pose_is_tracked_immediately() {
     let (rig, gripper) = (rig(true), gripper());
     let mut random = Random(5);
     let truth = pose(&mut random, 0.4);
@@ -298,7 +300,7 @@ fn what_is_acquired_is_tracked_at_once() {
 }
 
 #[test]
-fn swapped_views_blank_and_wrong_sizes_are_refused_by_name() {
+fn swapped_views_blank_images_and_wrong_sizes_have_their_own_errors() {
     let (rig, gripper) = (rig(true), gripper());
     let mut random = Random(6);
     let mut scratch = scratch();
@@ -316,7 +318,7 @@ fn swapped_views_blank_and_wrong_sizes_are_refused_by_name() {
     assert_eq!(e.map(|a| a.seen), Err(AcquireFailure::Size(View::Left)));
 }
 
-/// Marks on a ring, evenly but for what `odd` says.
+/// Marks on a ring, evenly spaced except for the change `odd`.
 fn ring(n: usize, odd: impl Fn(usize, &mut Mark)) -> Gripper {
     let mut marks = heapless::Vec::new();
     for k in 0..n {
@@ -330,7 +332,7 @@ fn ring(n: usize, odd: impl Fn(usize, &mut Mark)) -> Gripper {
 }
 
 #[test]
-fn symmetric_layouts_are_named() {
+fn symmetric_layouts_are_detected() {
     assert!(layout_is_ambiguous(&ring(8, |_, _| {})));
     assert!(layout_is_ambiguous(&ring(3, |_, _| {})));
     assert!(!layout_is_ambiguous(&ring(8, |k, m| if k == 2 {
@@ -339,7 +341,7 @@ fn symmetric_layouts_are_named() {
     assert!(!layout_is_ambiguous(&ring(8, |k, m| if k == 2 {
         m.position *= 0.8
     })));
-    // A shift below what images tell apart is no help.
+    // A displacement too small to be resolved in the images does not help.
     assert!(layout_is_ambiguous(&ring(8, |k, m| if k == 2 {
         m.position *= 0.99
     })));
@@ -348,7 +350,7 @@ fn symmetric_layouts_are_named() {
 }
 
 #[test]
-fn a_symmetric_gripper_is_refused_rather_than_guessed() {
+fn a_symmetric_gripper_is_refused() {
     let rig = rig(true);
     let gripper = ring(8, |_, _| {});
     let mut random = Random(7);

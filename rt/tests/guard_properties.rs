@@ -1,4 +1,4 @@
-//! The guard under arbitrary input: nothing that goes out breaks a limit, whatever comes in.
+//! The guard under arbitrary input: its output is always within the limits.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_rt::arm::{Dh, Joints, Model, READY};
@@ -23,8 +23,8 @@ fn joints() -> impl Strategy<Value = Joints> {
     prop::array::uniform6(rate())
 }
 
-/// A wish that lasts for some cycles, with a share, a cycle's length and whether it is a stop.
-fn wish() -> impl Strategy<Value = (Joints, usize, f64, f64, bool)> {
+/// Requested rates for some cycles, with a speed fraction, the length of a cycle and whether to stop.
+fn request() -> impl Strategy<Value = (Joints, usize, f64, f64, bool)> {
     let dt = prop_oneof![6 => Just(T), 2 => 0.0..0.006_f64, 1 => prop::num::f64::ANY];
     let share = prop_oneof![4 => Just(1.0), 2 => 0.0..1.0_f64, 1 => prop::num::f64::ANY];
     (joints(), 1..60_usize, share, dt, prop::bool::weighted(0.15))
@@ -48,7 +48,7 @@ proptest! {
     /// Speed, acceleration (over the real time of the step), gripper speed, joint ranges, finiteness.
     #[test]
     fn every_output_is_within_every_limit(
-        wishes in prop::collection::vec(wish(), 1..14),
+        requests in prop::collection::vec(request(), 1..14),
         near_end in 0..6_usize,
         jerk in prop_oneof![Just(0.0), Just(800.0), Just(150.0)],
     ) {
@@ -61,7 +61,7 @@ proptest! {
         let mut q = READY;
         q[near_end] = max[near_end] - 0.15;
         let mut last = [0.0; 6];
-        for (wanted, cycles, share, dt, stop) in wishes {
+        for (wanted, cycles, share, dt, stop) in requests {
             for _ in 0..cycles {
                 let jacobian = dh.body_jacobian(&q, &mount);
                 let out = if stop { guard.stop(dt) } else { guard.step(&wanted, &q, &jacobian, share, dt) };
@@ -72,7 +72,7 @@ proptest! {
                     prop_assert!(out.rates[i].abs() <= v[i] * (1.0 + 1e-12));
                     let change = (out.rates[i] - last[i]).abs();
                     prop_assert!(change <= limits.acceleration() * passed * (1.0 + 1e-9) + 1e-15, "{change}");
-                    // An arm that follows at once stays inside its range: it can always still stop.
+                    // An arm that follows without delay stays inside its range: it can always stop.
                     q[i] += out.rates[i] * passed;
                     prop_assert!(q[i] <= max[i] + 1e-9 && q[i] >= min[i] - 1e-9, "joint {i} at {}", q[i]);
                 }
@@ -84,7 +84,7 @@ proptest! {
                 last = out.rates;
             }
         }
-        // From anything, a stop reaches rest in bound, and stays.
+        // From any state, a stop reaches rest within its bound and stays there.
         let mut cycles = 0;
         while !guard.at_rest() {
             guard.stop(T);
@@ -94,7 +94,7 @@ proptest! {
         prop_assert_eq!(guard.stop(T).rates, [0.0; 6]);
     }
 
-    /// From rest towards a constant finite wish the direction never changes: the motion is slowed, never bent.
+    /// From rest towards constant finite rates the direction never changes: the motion is only slowed.
     #[test]
     fn the_direction_is_kept(wanted in prop::array::uniform6(-4.0..4.0_f64)) {
         prop_assume!(largest(&wanted) > 0.05);
@@ -118,14 +118,14 @@ proptest! {
         }
     }
 
-    /// On an even cycle, between the first steps of stops, the jerk stays within its limit.
+    /// With a constant period, the jerk is within its limit except in the first step of a stop.
     #[test]
-    fn jerk_is_bounded_on_an_even_cycle(wishes in prop::collection::vec((prop::array::uniform6(-1.0..1.0_f64), 1..80_usize), 1..8)) {
+    fn jerk_is_bounded_with_a_constant_period(requests in prop::collection::vec((prop::array::uniform6(-1.0..1.0_f64), 1..80_usize), 1..8)) {
         let limits = Limits::new(&limits(800.0), Model::Ur5e, PERIOD_NS).unwrap();
         let mut guard = Guard::new(limits);
         let jacobian = Dh::nominal(Model::Ur5e).body_jacobian(&READY, &Pose::identity());
         let (mut last, mut change) = ([0.0; 6], [0.0; 6]);
-        for (wanted, cycles) in wishes {
+        for (wanted, cycles) in requests {
             for _ in 0..cycles {
                 let out = guard.step(&wanted, &READY, &jacobian, 1.0, T).rates;
                 for i in 0..6 {
@@ -140,7 +140,7 @@ proptest! {
 }
 
 #[test]
-fn names_what_held_the_motion_back() {
+fn the_limits_that_held_the_motion_back_are_reported() {
     let limits = Limits::new(&LimitSettings::default(), Model::Ur5e, PERIOD_NS).unwrap();
     let jacobian = Dh::nominal(Model::Ur5e).body_jacobian(&READY, &Pose::identity());
     let held = |wanted: Joints, q: Joints| Guard::new(limits).step(&wanted, &q, &jacobian, 1.0, T).held;

@@ -1,4 +1,4 @@
-//! Whatever the images, stamps, poses and rigs are: no panic, no endless loop, and nothing that is not finite.
+//! Arbitrary images, stamps, poses and rigs: no panic, no endless loop, and only finite results.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod support;

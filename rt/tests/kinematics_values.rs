@@ -1,6 +1,6 @@
-//! Values only: the arm's poses and Jacobians against numbers from an independent library.
+//! The arm's poses and Jacobians compared with values of an independent library.
 //!
-//! `data/kinematics_pin.csv` was made by `data/make_kinematics.py` with Pinocchio; see there for the columns.
+//! `data/make_kinematics.py` generated `data/kinematics_pin.csv` with Pinocchio; it documents the columns.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_rt::arm::{Dh, Joints, Model};

@@ -1,4 +1,4 @@
-//! The robot-locked cycle on a virtual clock: jitter, drift, lost and held packages, silence, a controller that restarts.
+//! The phase lock on a virtual clock: jitter, drift, lost and delayed packages, silence, a controller that restarts.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_rt::rtde::PhaseLock;
@@ -16,21 +16,21 @@ impl Random {
     }
 }
 
-/// A robot and the way to it.
+/// A robot and the network to it.
 struct Robot {
-    /// Its clock against ours.
+    /// Drift of its clock, relative.
     ppm: f64,
     /// Its first step, ns.
     phase: u64,
     /// Delay of a package: at least this, and up to that much more, ns.
     delay: u64,
     jitter: f64,
-    /// Share of packages that never come, and that come 5 ms late.
+    /// Fraction of packages that are lost, and that are 5 ms late.
     lost: f64,
     held: f64,
     /// Silent between these times, ns.
     silence: (u64, u64),
-    /// From this time on its steps come that much later, ns: it was restarted.
+    /// From this time on its steps are this much later, ns: it was restarted.
     restart: (u64, u64),
 }
 
@@ -49,22 +49,22 @@ impl Default for Robot {
     }
 }
 
-/// One cycle as it came.
+/// One cycle.
 #[derive(Clone, Copy, Debug)]
 struct Cycle {
     at: u64,
-    /// Its place on the grid.
+    /// Its grid point.
     place: u64,
     locked: bool,
-    /// From the middle of the package's usual arrival to that place, ns, wrapped to half a period either way.
+    /// Time from the mean arrival of the package to that grid point, ns, wrapped to half a period.
     phase: f64,
 }
 
-/// Runs a lock against a robot for so many cycles of `compute` ns.
+/// Runs a phase lock with a robot for a number of cycles of `compute` ns.
 fn run(robot: &Robot, cycles: usize, compute: u64, seed: u64) -> (PhaseLock, Vec<Cycle>) {
     let mut random = Random(seed);
     let period = PERIOD as f64 * (1.0 + robot.ppm * 1e-6);
-    // Arrivals in order, as TCP delivers them: a held package holds those behind it.
+    // Arrivals in order, as TCP delivers them: a delayed package delays those after it.
     let mut arrivals = Vec::new();
     let mut held_until = 0u64;
     for k in 0..2 * cycles {
@@ -95,7 +95,7 @@ fn run(robot: &Robot, cycles: usize, compute: u64, seed: u64) -> (PhaseLock, Vec
         let cycle =
             Cycle { at: now, place: lock.next_ns(), locked: lock.is_locked(), phase: (turns - turns.round()) * period };
         seen.push(cycle);
-        // Drain to the newest.
+        // Take the newest package.
         let from = read;
         while arrivals.get(read).is_some_and(|a| a.0 <= now) {
             read += 1;
@@ -107,7 +107,7 @@ fn run(robot: &Robot, cycles: usize, compute: u64, seed: u64) -> (PhaseLock, Vec
     (lock, seen)
 }
 
-/// What holds for every cycle of every run, locked or not.
+/// Properties of every cycle of every run, locked or not.
 fn check_bounds(lock: &PhaseLock, cycles: &[Cycle]) {
     let tolerance = lock.tolerance_ns();
     for pair in cycles.windows(2) {
@@ -120,7 +120,7 @@ fn check_bounds(lock: &PhaseLock, cycles: &[Cycle]) {
 }
 
 #[test]
-fn it_locks_within_a_second_and_stays_through_jitter_drift_and_losses() {
+fn locks_within_a_second_and_stays_locked_with_jitter_drift_and_losses() {
     for (seed, ppm) in [100.0, -100.0, 0.0, 30.0].into_iter().enumerate() {
         let robot = Robot { ppm, lost: 0.05, ..Robot::default() };
         let (lock, cycles) = run(&robot, 60_000, 200_000, seed as u64);
@@ -150,7 +150,7 @@ fn every_phase_at_the_start_is_found() {
 }
 
 #[test]
-fn held_packages_do_not_pull_it_away() {
+fn delayed_packages_do_not_shift_the_grid() {
     let robot = Robot { ppm: -80.0, held: 0.01, ..Robot::default() };
     let (lock, cycles) = run(&robot, 30_000, 200_000, 3);
     check_bounds(&lock, &cycles);
@@ -160,7 +160,7 @@ fn held_packages_do_not_pull_it_away() {
 }
 
 #[test]
-fn silence_leaves_a_timer_and_the_robot_is_found_again() {
+fn without_packages_it_is_a_timer_and_locks_again_afterwards() {
     let silence = (START + 4_000_000_000, START + 8_000_000_000);
     let robot = Robot { ppm: 100.0, silence, ..Robot::default() };
     let (lock, cycles) = run(&robot, 8000, 200_000, 9);
@@ -169,7 +169,7 @@ fn silence_leaves_a_timer_and_the_robot_is_found_again() {
     assert!(at(silence.0 - 1_000_000_000).locked);
     let given_up = at(silence.0 + 100_000_000);
     assert!(!given_up.locked, "25 silent cycles end the lock: {given_up:?}");
-    // It goes on at the rhythm that it had learnt.
+    // It continues with the estimated drift.
     let during: Vec<_> = cycles.iter().filter(|b| b.at > silence.0 + 100_000_000 && b.at < silence.1).collect();
     let mean = (during.last().unwrap().at - during[0].at) as f64 / (during.len() - 1) as f64;
     assert!((mean - PERIOD as f64).abs() < 400.0, "{mean} ns");
@@ -187,7 +187,7 @@ fn a_restart_at_another_phase_is_followed_without_a_jump() {
 }
 
 #[test]
-fn a_stall_is_counted_and_the_grid_kept() {
+fn missed_periods_are_counted_and_the_grid_is_kept() {
     let mut lock = PhaseLock::new(PERIOD, START);
     let first = lock.next_ns();
     assert_eq!(lock.arrived(first, false), first);
@@ -197,7 +197,7 @@ fn a_stall_is_counted_and_the_grid_kept() {
 }
 
 #[test]
-fn stamps_that_are_no_numbers_and_clocks_that_jump_leave_the_bounds_alone() {
+fn nan_stamps_and_jumping_clocks_keep_the_bounds() {
     let mut lock = PhaseLock::new(PERIOD, START);
     let mut now = START;
     let mut last = lock.next_ns();

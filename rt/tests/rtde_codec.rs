@@ -1,4 +1,4 @@
-//! RTDE against literal bytes, against arbitrary bytes, and the client's half against a server's half in memory.
+//! RTDE compared with literal bytes, fed with arbitrary bytes, and a client and a server joined in memory.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_rt::arm::{ArmCommand, ArmMode};
@@ -26,7 +26,8 @@ fn controller_case(version: Version, message: ControllerMessage<'_>, bytes: &[u8
     assert_eq!(message.emit(version, &mut out[..n - 1]), Err(NoRoom { needed: n }));
 }
 
-// The literals follow the struct formats of UR's Python client: '>HB' header, '>H' version, '>IIII' identity, '>d' frequency.
+// The literals follow the struct formats of UR's Python client: '>HB' header, '>H' version, '>IIII' identity, '>d'
+// frequency.
 #[test]
 fn every_message_of_a_client_has_its_literal_bytes() {
     use ClientMessage::*;
@@ -79,7 +80,7 @@ fn malformed_messages_are_named() {
     assert_eq!(nan, Err(MessageError::NotANumber(Kind::SetupOutputs)));
 }
 
-/// A server in memory: the other half of the codec, with inputs that another client may hold.
+/// A server in memory, with inputs that another client may hold.
 struct Server {
     version: Version,
     speaks: u16,
@@ -154,7 +155,7 @@ impl Server {
     }
 }
 
-/// Runs the handshake until it is done, refused or stuck; bytes travel in pieces of `piece`.
+/// Runs the handshake until it is done, refused or stuck; bytes are passed in pieces of `piece` bytes.
 fn meet(server: &mut Server, piece: usize) -> Result<Session, ClientError> {
     let mut session = Session::new(&STATE_FIELDS, &[&COMMAND_FIELDS], Some(500.0))?;
     let (mut to_server, mut to_client) = (Framer::new([0u8; 8192]), Framer::new([0u8; 8192]));
@@ -233,7 +234,7 @@ fn refusals_name_the_field() {
 }
 
 #[test]
-fn what_is_not_a_number_is_sent_as_a_stop() {
+fn values_that_are_not_finite_are_sent_as_a_stop() {
     let mut out = [0u8; CommandWriter::PACKAGE];
     let writer = CommandWriter::new(1, 5, 9.0);
     for (rates, targets) in [([f64::NAN; 6], None), ([0.1; 6], Some([f64::INFINITY; 6]))] {
@@ -254,7 +255,7 @@ fn gaps_are_counted_by_the_controllers_clock() {
     assert_eq!((meter.packages, meter.missing), (7, 2));
 }
 
-/// Everything a stream gives, as text; the buffer is smaller than the largest package, so that refusals are met as well.
+/// All results of a stream as text; the buffer is smaller than the largest package, so that refusals occur as well.
 fn events(stream: &[u8], cuts: &[usize], version: Version) -> Vec<String> {
     let mut framer = Framer::new(vec![0u8; 600]);
     let mut out = Vec::new();
@@ -281,7 +282,7 @@ fn events(stream: &[u8], cuts: &[usize], version: Version) -> Vec<String> {
     out
 }
 
-/// Bytes that look like packages often enough to get behind the header.
+/// Bytes that often look like packages, so that parsing gets beyond the header.
 fn stream() -> impl Strategy<Value = Vec<u8>> {
     let kind = prop_oneof![proptest::sample::select(b"VvMUOISP".to_vec()), any::<u8>()];
     let body = prop_oneof![
@@ -353,7 +354,7 @@ proptest! {
     }
 }
 
-/// Fast fuzz: `GRASPD_FUZZ_CASES` cases of mutated packages through every parser (20 000 unless told).
+/// Fast fuzz: `GRASPD_FUZZ_CASES` cases of mutated packages through every parser (default 20 000).
 #[test]
 fn fuzz_every_parser() {
     let cases: u64 = std::env::var("GRASPD_FUZZ_CASES").ok().and_then(|s| s.parse().ok()).unwrap_or(20_000);

@@ -1,4 +1,5 @@
-//! Faults of the mark list (M01 to M09) against the tracker: degrade, refuse, stop; never follow.
+//! Marks that are hidden, duplicated, exchanged or imitated: the tracker degrades, refuses or stops, and never follows
+//! them.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod support;
@@ -29,7 +30,7 @@ impl World {
         w
     }
 
-    /// Renders the gripper without the hidden marks, with whatever `extra` draws, and steps.
+    /// Renders the gripper without the hidden marks, with the shapes that `extra` draws, and runs a step.
     fn look(&mut self, hidden: &[usize], extra: &mut dyn FnMut(View, &mut Canvas)) -> Vision {
         let (rig, gripper) = (*self.cycle.rig(), self.cycle.gripper().clone());
         let look = Scene::default();
@@ -75,8 +76,8 @@ fn fewer_and_fewer_marks_degrade_and_then_stop() {
 }
 
 #[test]
-fn a_twin_beside_a_mark_is_not_taken_for_it() {
-    // The same disc again, two and a half radii away, beside each of five marks; the marks themselves are there.
+fn a_second_disc_next_to_a_mark_is_not_taken_for_it() {
+    // A copy of the disc, two and a half radii away, next to each of five marks; the marks are visible.
     let mut w = World::new(2);
     let at: Vec<_> = View::BOTH.iter().map(|v| [0, 3, 6, 9, 12].map(|i| w.mark(*v, i))).collect();
     let v = w.look(&[], &mut |view, canvas| {
@@ -107,9 +108,9 @@ fn a_blob_in_place_of_a_hidden_mark_is_refused() {
 }
 
 #[test]
-fn two_marks_that_trade_colour_are_both_dropped() {
+fn two_marks_with_exchanged_colours_are_both_dropped() {
     let mut w = World::new(4);
-    // Mark 4 is light, mark 3 dark; each gets the other's disc painted over it.
+    // Mark 4 is light, mark 3 dark; each is painted over with the other's disc.
     let at: Vec<_> = View::BOTH.iter().map(|v| [w.mark(*v, 4), w.mark(*v, 3)]).collect();
     let v = w.look(&[3, 4], &mut |view, canvas| {
         let [a, b] = at[view.index()];
@@ -135,7 +136,7 @@ fn other_shapes_in_place_of_marks_are_refused() {
     for (i, name) in [(2, "square"), (7, "triangle"), (13, "bar")] {
         for view in 0..2 {
             if let Some(m) = v.marks[view][i] {
-                // A square about a disc's centre may pass for the disc, if it says so little that nothing is pulled.
+                // A square centred on a disc may be accepted as the disc if its weight is too small to shift the pose.
                 let c = w.mark(View::BOTH[view], i);
                 assert!((m.pixel.x - c.0).hypot(m.pixel.y - c.1) < 0.5, "{name} taken at {:?} for {c:?}", m.pixel);
             }
@@ -147,7 +148,7 @@ fn other_shapes_in_place_of_marks_are_refused() {
 #[test]
 fn a_gripper_that_leaves_the_image_degrades_before_it_is_lost() {
     let mut w = World::new(6);
-    // To the left in steps of 12 mm, until it is out of both images.
+    // Moves to the left in steps of 12 mm until it is out of both images.
     let (mut degraded, mut lost) = (None, None);
     for k in 0..140 {
         w.truth.translation.vector.x -= 0.012;

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Publishes stereo pairs to graspd from Python: a camera driver to start from. Needs: pip install iceoryx2==0.10.0 (numpy optional).
+"""Publishes stereo pairs to graspd from Python: a camera driver to start from. Needs: pip install iceoryx2==0.10.0.
 
-The layout, the quality of service and the rules are those of shm/LAYOUT.md. Images here are a moving ramp; replace `image()`.
+Layout, quality of service and rules are those of shm/LAYOUT.md. The images are a moving ramp; replace `image()`.
 """
 
 import argparse
@@ -63,40 +63,40 @@ def default_root() -> str:
     return os.path.join(d, "graspd") if os.path.isdir(d) else f"/tmp/graspd-{os.geteuid()}"
 
 
-def image(width: int, height: int, k: int, eye: int) -> bytes:
+def image(width: int, height: int, k: int, view: int) -> bytes:
     """One mono8 image: a diagonal ramp that moves with k. A real driver copies its camera's buffer here."""
-    row = bytes((x + 3 * k + 50 * eye) & 0xFF for x in range(width + height))
+    row = bytes((x + 3 * k + 50 * view) & 0xFF for x in range(width + height))
     return b"".join(row[y : y + width] for y in range(height))
 
 
 def raw(path, n):
-    """An image from a file of exactly n bytes."""
+    """Reads an image from a file of exactly n bytes."""
     with open(path, "rb") as f:
         data = f.read()
     if len(data) != n:
-        sys.exit(f"{path}: {len(data)} bytes, {n} expected: width x height of mono8")
+        sys.exit(f"{path}: {len(data)} bytes, expected {n}: width x height of mono8")
     return data
 
 
 def main() -> int:
     a = argparse.ArgumentParser(description=__doc__)
-    a.add_argument("--root", default=default_root(), help="shm root path, as in graspd.toml")
-    a.add_argument("--prefix", default=f"graspd{os.geteuid()}_", help="shm prefix, as in graspd.toml")
-    a.add_argument("--cell", default="default")
+    a.add_argument("--root", default=default_root(), help="shared-memory root folder: shm.root of graspd.toml")
+    a.add_argument("--prefix", default=f"graspd{os.geteuid()}_", help="prefix of names in /dev/shm; graspd uses the default")
+    a.add_argument("--cell", default="cell", help="cell of graspd.toml")
     a.add_argument("--width", type=int, default=1280)
     a.add_argument("--height", type=int, default=1024)
     a.add_argument("--rate", type=float, default=60.0, help="pairs per second")
     a.add_argument("--count", type=int, default=0, help="stop after so many pairs; 0 never")
-    a.add_argument("--drop-every", type=int, default=0, help="lose every n-th pair on purpose")
+    a.add_argument("--drop-every", type=int, default=0, help="drop every n-th pair, as a test of the reader")
     a.add_argument("--left-raw", help="publish this file of width x height bytes instead of a test image")
-    a.add_argument("--right-raw", help="the same for the right eye")
+    a.add_argument("--right-raw", help="the same for the right image")
     a.add_argument("--serial-left", default="left")
     a.add_argument("--serial-right", default="right")
     o = a.parse_args()
 
     iox2.set_log_level(iox2.LogLevel.Fatal)
     os.makedirs(o.root, mode=0o700, exist_ok=True)
-    # A configuration of our own: no file is read, and nothing is shared with other iceoryx2 users of the machine.
+    # The configuration is set here, not read from a file, so that nothing is shared with other iceoryx2 users of the machine.
     config = iox2.config.default()
     config.global_cfg.root_path = iox2.Path.new(o.root)
     config.global_cfg.prefix = iox2.FileName.new(o.prefix)
@@ -130,7 +130,7 @@ def main() -> int:
     if o.left_raw and o.right_raw:
         images = [[raw(o.left_raw, n), raw(o.right_raw, n)]] * 8
     else:
-        images = [[image(o.width, o.height, k, eye) for eye in (0, 1)] for k in range(8)]
+        images = [[image(o.width, o.height, k, view) for view in (0, 1)] for k in range(8)]
     period = 1e9 / o.rate
     start = time.monotonic_ns()
     print('{"ready":true}', flush=True)
@@ -145,8 +145,8 @@ def main() -> int:
             continue
         sample = publisher.loan_slice_uninit(2 * n)
         target = sample.payload().as_ptr()
-        for eye in (0, 1):
-            ctypes.memmove(target + eye * n, images[sequence % 8][eye], n)
+        for view in (0, 1):
+            ctypes.memmove(target + view * n, images[sequence % 8][view], n)
         h = sample.user_header().contents
         h.magic, h.layout_version, h.header_size = MAGIC, 1, 192
         h.sequence, h.trigger = sequence, sequence

@@ -1,11 +1,12 @@
-//! What can go wrong when a topic is created, opened or used; each error says what was expected and what to do.
+//! Errors of creating, opening and using a topic; each states what was expected and what to do.
 
+use crate::frame_error::FrameError;
 use crate::names::NamesError;
 
-/// Failure of the shared-memory layer.
+/// An error of the shared-memory layer.
 #[derive(Debug, thiserror::Error)]
 pub enum ShmError {
-    /// Root folder, prefix or cell name unusable.
+    /// Root folder, prefix or cell name cannot be used.
     #[error(transparent)]
     Names(#[from] NamesError),
     /// The process's node could not be created.
@@ -21,10 +22,10 @@ pub enum ShmError {
         /// iceoryx2's reason.
         reason: String,
     },
-    /// The service exists with another layout or other quality of service, or cannot be created.
+    /// The service exists with another layout or quality of service, or cannot be created.
     #[error(
-        "cannot open service '{service}': {reason}. Expected {expected}. A process that disagrees opened it first (an older camera \
-         driver?): stop every publisher and subscriber of this cell, update them, start again; shm/LAYOUT.md has the layout"
+        "cannot open service '{service}': {reason}. Expected {expected}. Another process (an older camera driver?) created it with \
+         other properties: stop every publisher and subscriber of this cell, update them, start again; shm/LAYOUT.md has the layout"
     )]
     Service {
         /// Service name.
@@ -36,8 +37,8 @@ pub enum ShmError {
     },
     /// A publisher or subscriber could not be created.
     #[error(
-        "cannot create a {port} on '{service}': {reason}. The service allows {limit} of them; another one is running (or died less \
-         than a second ago)"
+        "cannot create a {port} on '{service}': {reason}. The service allows {limit} of them, and they are in use: stop one, or wait \
+         a second if it has just died"
     )]
     Port {
         /// `publisher` or `subscriber`.
@@ -46,13 +47,13 @@ pub enum ShmError {
         service: String,
         /// iceoryx2's reason.
         reason: String,
-        /// Largest number of such ports.
+        /// Number of such ports that the service allows.
         limit: usize,
     },
     /// A sample could not be loaned.
     #[error("cannot loan a frame of {bytes} bytes: {reason}")]
     Loan {
-        /// Bytes asked for.
+        /// Requested size, bytes.
         bytes: usize,
         /// iceoryx2's reason.
         reason: String,
@@ -63,7 +64,7 @@ pub enum ShmError {
         /// iceoryx2's reason.
         reason: String,
     },
-    /// The frame's own description is not possible.
-    #[error("frame geometry refused: {0}")]
-    Geometry(crate::frame::Reject),
+    /// Size, stride and pixel format of a publisher do not fit together.
+    #[error("the frame geometry is not possible: {0}")]
+    Geometry(FrameError),
 }

@@ -1,20 +1,27 @@
-//! graspd's contract with other processes, over iceoryx2 shared memory.
+//! graspd's interface to other processes, over iceoryx2 shared memory; the only crate that uses iceoryx2.
 //!
-//! The only crate that knows iceoryx2. [`frame`] is the stereo topic a camera driver publishes (byte layout in
-//! `LAYOUT.md`, for drivers in other languages); [`node`] creates the one node a process has; [`names`] says where the
-//! shared files live and how services are called.
+//! In reading order:
 //!
-//! Whatever comes out of shared memory was written by another process and is *data*, never trusted: sizes, stamps and
-//! identities are checked against the sample that really arrived before a pixel is read, and every refusal is a typed,
-//! counted [`frame::Reject`].
+//! | module | content | page for other languages |
+//! |---|---|---|
+//! | [`names`] | root folder, prefix and cell: where processes meet | `LAYOUT.md` |
+//! | [`node`] | the one iceoryx2 node of a process | |
+//! | [`frame`] | the stereo topic of a camera driver, with an example | `LAYOUT.md`, `python/publish_stereo.py` |
+//! | [`control`] | telemetry out of the daemon, requests into it | `CONTROL.md` |
+//! | [`ShmError`], [`frame::FrameError`] | why a topic cannot be opened, why a sample is refused | |
+//! | [`Vital`], `private` | files whose loss cuts the daemon off; their permissions | `CONTROL.md` |
+//!
+//! Whatever arrives through shared memory was written by another process and is not trusted: sizes, stamps and
+//! identities are checked against the sample that arrived before a pixel is read. Each refusal is a typed, counted
+//! [`frame::FrameError`].
 
 pub mod control;
 mod error;
 pub mod frame;
+mod frame_error;
 pub mod names;
 pub mod node;
 mod private;
-mod sys;
 mod vital;
 
 pub use error::ShmError;

@@ -1,13 +1,20 @@
-//! Where shared files live and how services are called: root folder, prefix, cell.
+//! Where processes meet: root folder, prefix and cell, which make up the names of shared files and services.
 
 use iceoryx2::prelude::*;
 use rustix::fs::{FileType, Mode, lstat, mkdir};
 use std::path::{Path as StdPath, PathBuf};
 
-/// Root folder, prefix and cell: two processes meet only when all three are equal.
+/// Cell of a daemon or driver that is given none.
+pub const DEFAULT_CELL: &str = "cell";
+/// Longest root path, bytes: with the names that iceoryx2 appends it stays within its limit of 255.
+const MAX_ROOT_BYTES: usize = 180;
+/// Longest prefix and cell name, bytes.
+const MAX_NAME_BYTES: usize = 32;
+
+/// Root folder, prefix and cell. Two processes meet only if all three are equal.
 ///
-/// The root folder holds iceoryx2's discovery files; the prefix starts the name of every object in `/dev/shm`, which is one
-/// flat folder for the machine, so that two root folders also need two prefixes. The cell starts every service name.
+/// The root folder holds iceoryx2's discovery files. The prefix starts the name of every object in `/dev/shm`, one flat
+/// folder for the machine: two root folders therefore need two prefixes. The cell starts every service name.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Names {
     root: PathBuf,
@@ -15,27 +22,27 @@ pub struct Names {
     cell: String,
 }
 
-/// Why names are refused.
+/// Why root folder, prefix or cell cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NamesError {
-    /// `cell` is empty, too long or has other characters than a-z, 0-9, `-`, `_`.
-    #[error("cell '{0}' is not a name: use 1 to 32 of a-z, 0-9, '-' and '_'")]
+    /// `cell` is empty, longer than 32 bytes, or has characters other than a-z, 0-9, `-`, `_`.
+    #[error("cell '{0}' is not a valid name: use 1 to 32 of a-z, 0-9, '-' and '_'")]
     Cell(String),
-    /// `prefix` is empty, too long or has other characters than a-z, A-Z, 0-9, `-`, `_`.
-    #[error("shm prefix '{0}' is not a name: use 1 to 32 of letters, digits, '-' and '_'")]
+    /// `prefix` is empty, longer than 32 bytes, or has characters other than a-z, A-Z, 0-9, `-`, `_`.
+    #[error("shm prefix '{0}' is not a valid name: use 1 to 32 of letters, digits, '-' and '_'")]
     Prefix(String),
-    /// `root_path` is relative, too long or not text.
+    /// The root path is relative, longer than 180 bytes, or not UTF-8.
     #[error("shm root path '{0}' cannot be used: give an absolute path of at most 180 bytes without '..'")]
     Root(String),
-    /// The root folder cannot be made.
-    #[error("cannot create the shm root folder '{path}': {reason}")]
+    /// A folder or file cannot be created.
+    #[error("cannot create '{path}' for the shared memory: {reason}")]
     Create {
-        /// The folder.
+        /// The folder or file.
         path: String,
         /// The system's reason.
         reason: String,
     },
-    /// The root folder belongs to somebody else, is no folder, or others may write into it (fault H09).
+    /// The root folder belongs to another user, is not a folder, or others may write into it.
     #[error(
         "shm root folder '{path}' is not safe: {reason}. Remove it or run: chmod 700 '{path}' (owner must be uid {uid})"
     )]
@@ -47,7 +54,7 @@ pub enum NamesError {
         /// The user this process runs as.
         uid: u32,
     },
-    /// A file of the shared memory is not this user's.
+    /// A file of the shared memory belongs to another user or is not a regular file.
     #[error("'{path}' cannot be used: {reason}, and this program runs as uid {uid}; remove it as its owner or as root")]
     Foreign {
         /// The file.
@@ -60,19 +67,22 @@ pub enum NamesError {
 }
 
 fn is_name(s: &str, upper: bool) -> bool {
-    (1..=32).contains(&s.len())
+    (1..=MAX_NAME_BYTES).contains(&s.len())
         && s.bytes().all(|b| {
             b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-' || b == b'_' || (upper && b.is_ascii_uppercase())
         })
 }
 
 impl Names {
-    /// Names from the configuration; checks their form, touches nothing.
+    /// Checks the form of the three names; creates nothing.
+    ///
+    /// # Errors
+    /// [`NamesError::Root`], [`NamesError::Prefix`] or [`NamesError::Cell`].
     pub fn new(root: impl Into<PathBuf>, prefix: &str, cell: &str) -> Result<Self, NamesError> {
         let root = root.into();
         let shown = root.display().to_string();
         let dotdot = root.components().any(|c| matches!(c, std::path::Component::ParentDir));
-        if !root.is_absolute() || root.to_str().is_none_or(|s| s.len() > 180) || dotdot {
+        if !root.is_absolute() || root.to_str().is_none_or(|s| s.len() > MAX_ROOT_BYTES) || dotdot {
             return Err(NamesError::Root(shown));
         }
         if !is_name(prefix, true) {
@@ -84,12 +94,16 @@ impl Names {
         Ok(Self { root, prefix: prefix.to_string(), cell: cell.to_string() })
     }
 
-    /// The names every graspd process of one user agrees on when nothing is configured.
+    /// The names on which all graspd processes of one user agree when nothing is configured; the cell's default is
+    /// [`DEFAULT_CELL`].
+    ///
+    /// # Errors
+    /// As [`Self::new`].
     pub fn default_for_user(cell: &str) -> Result<Self, NamesError> {
         Self::new(Self::default_root(), &Self::default_prefix(), cell)
     }
 
-    /// `$XDG_RUNTIME_DIR/graspd`, else `/tmp/graspd-<uid>`.
+    /// `$XDG_RUNTIME_DIR/graspd` if that variable names a folder, else `/tmp/graspd-<uid>`.
     pub fn default_root() -> PathBuf {
         match std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from) {
             Some(d) if d.is_absolute() && d.is_dir() => d.join("graspd"),
@@ -97,7 +111,7 @@ impl Names {
         }
     }
 
-    /// `graspd<uid>_`: `/dev/shm` is shared by all users of a machine.
+    /// `graspd<uid>_`, because `/dev/shm` is shared by all users of a machine.
     pub fn default_prefix() -> String {
         format!("graspd{}_", rustix::process::geteuid().as_raw())
     }
@@ -122,9 +136,12 @@ impl Names {
         format!("{}/{topic}", self.cell)
     }
 
-    /// Makes the root folder (0700) when it is not there, and refuses one that others own or may write into.
+    /// Creates the root folder (mode 0700) if it is missing, and refuses one that another user owns or may write into.
     ///
     /// `allow_insecure` skips the refusal, not the creation.
+    ///
+    /// # Errors
+    /// [`NamesError::Create`] or [`NamesError::Insecure`].
     pub fn ensure_root(&self, allow_insecure: bool) -> Result<(), NamesError> {
         let shown = self.root.display().to_string();
         if let Some(parent) = self.root.parent() {
@@ -140,7 +157,7 @@ impl Names {
         }
         let uid = rustix::process::geteuid().as_raw();
         let insecure = |reason: String| NamesError::Insecure { path: shown.clone(), reason, uid };
-        // Not followed: in a folder like /tmp anybody can put a link where ours is looked for.
+        // lstat, because in a folder like /tmp anybody can put a symbolic link in place of the root folder.
         let st = lstat(&self.root).map_err(|e| insecure(e.to_string()))?;
         match FileType::from_raw_mode(st.st_mode) {
             FileType::Directory => {}
@@ -156,7 +173,7 @@ impl Names {
         Ok(())
     }
 
-    /// iceoryx2's configuration, built here and nowhere read from a file.
+    /// iceoryx2's configuration. It is built here, not read from a file.
     pub(crate) fn config(&self) -> Result<Config, NamesError> {
         let bad_root = || NamesError::Root(self.root.display().to_string());
         let root = self.root.to_str().ok_or_else(bad_root)?;
@@ -173,7 +190,7 @@ mod tests {
     use std::os::unix::fs::PermissionsExt;
 
     #[test]
-    fn names_that_could_escape_are_refused() {
+    fn names_with_path_separators_are_refused() {
         for (root, prefix, cell) in [
             ("relative", "p", "c"),
             ("/a/../b", "p", "c"),
@@ -189,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn a_root_that_others_may_write_is_refused_until_allowed() {
+    fn a_root_that_others_may_write_is_refused_unless_allowed() {
         let dir = std::env::temp_dir().join(format!("graspd-names-{}", std::process::id()));
         let names = Names::new(&dir, "t_", "c").unwrap();
         names.ensure_root(false).unwrap();
@@ -201,13 +218,13 @@ mod tests {
     }
 
     #[test]
-    fn a_link_in_the_place_of_the_root_is_refused() {
+    fn a_symbolic_link_as_root_is_refused() {
         let dir = std::env::temp_dir().join(format!("graspd-names-link-{}", std::process::id()));
         let link = dir.join("root");
         std::fs::create_dir_all(dir.join("elsewhere")).unwrap();
         std::os::unix::fs::symlink(dir.join("elsewhere"), &link).unwrap();
-        let said = Names::new(&link, "t_", "c").unwrap().ensure_root(false).unwrap_err().to_string();
-        assert!(said.contains("symbolic link"), "{said}");
+        let error = Names::new(&link, "t_", "c").unwrap().ensure_root(false).unwrap_err().to_string();
+        assert!(error.contains("symbolic link"), "{error}");
         std::fs::remove_dir_all(&dir).unwrap();
     }
 }

@@ -3,28 +3,35 @@
 use crate::{Names, ShmError, private};
 use iceoryx2::prelude::*;
 
-/// The service variant everything here uses: between processes, ports not shared between threads.
+/// The service variant in use: between processes, with ports that are not shared between threads.
 pub type Ipc = ipc::Service;
 
-/// A process's node together with the names it was made with. `Send`: make it in `main`, move it where ports are created.
+/// A process's node, with the names it was created with.
 ///
-/// Ports (publisher, subscriber) are not `Send`: create them on the thread that uses them.
+/// It is `Send`: create it in `main` and move it to where ports are created. Ports (publisher, subscriber) are not
+/// `Send`: create them on the thread that uses them.
 #[derive(Debug)]
 pub struct ShmNode {
     node: Node<Ipc>,
     names: Names,
 }
 
-/// Creates the process's node. Also makes and checks the root folder.
+/// Creates the process's node, and creates and checks the root folder.
 ///
-/// `role` becomes the node's name as tools show it. Signals stay the caller's: iceoryx2 installs no handler.
+/// `role` becomes the node's name in tools. iceoryx2 installs no signal handler.
+///
+/// # Errors
+/// The root folder or the node cannot be created, or the root folder is not safe.
 pub fn create_node(names: &Names, role: &str) -> Result<ShmNode, ShmError> {
     create_node_with(names, role, false)
 }
 
-/// As [`create_node`], accepting a root folder that others may write when `allow_insecure`.
+/// As [`create_node`]; with `allow_insecure` also in a root folder that others may write into.
+///
+/// # Errors
+/// As [`create_node`].
 pub fn create_node_with(names: &Names, role: &str, allow_insecure: bool) -> Result<ShmNode, ShmError> {
-    // iceoryx2 logs to stderr, and warns that it found no configuration file: by design there is none.
+    // iceoryx2 would warn on stderr that there is no configuration file, which is intended.
     set_log_level_from_env_or(LogLevel::Fatal);
     names.ensure_root(allow_insecure)?;
     if !allow_insecure {
@@ -57,14 +64,14 @@ impl ShmNode {
         &self.names
     }
 
-    /// Number of the node, as its files are called.
+    /// Number of the node, which the names of its files contain.
     pub(crate) fn number(&self) -> String {
         self.node.id().value().to_string()
     }
 
-    /// Removes what processes that died without saying goodbye left behind. Takes milliseconds: never on a real-time thread.
+    /// Removes the nodes of processes that were killed. Takes milliseconds: never call it on a real-time thread.
     ///
-    /// A supervisor calls it about once a second; without it a killed publisher keeps its place in the service.
+    /// Call it about once a second. Without it a killed publisher counts against the service's limit for ever.
     pub fn clean_up(&self) {
         let _ = self.node.try_cleanup_dead_nodes();
     }

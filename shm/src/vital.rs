@@ -1,9 +1,9 @@
-//! The files without which nobody finds the daemon: watched, because their loss shows in nothing else.
+//! Watches the files through which other processes reach the daemon, because their loss has no other symptom.
 //!
-//! A mapped segment lives on when its name is deleted, so that a tmp cleaner, `RemoveIPC` or a slip leaves a daemon that
-//! drives and that no verb reaches. A segment is known by its number, its size, its owner and its first bytes, iceoryx2's
-//! version. Not by its modification time: the first write of a new mapping sets it. A discovery file is written once and
-//! never mapped: there the time counts.
+//! A mapped segment remains usable after its name is deleted. A tmp cleaner, `RemoveIPC` or a mistake can so leave a
+//! daemon that drives the arm and that no request reaches. A segment is identified by inode, size, owner and its first
+//! bytes (the version of iceoryx2), not by its modification time, which the first write through a new mapping changes.
+//! A discovery file is written once and never mapped, so there the modification time counts.
 
 use crate::ShmNode;
 use crate::private::{self, FOLDER};
@@ -11,17 +11,17 @@ use std::collections::BTreeMap;
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
-/// Bytes at the beginning of a segment that iceoryx2 writes once: its version.
+/// Leading bytes of a segment that iceoryx2 writes once, bytes: its version.
 const HEAD: usize = 8;
 
-/// What a file is known by: device, number, size, owner, then its modification time or its first bytes.
+/// Identity of a file: device, inode, size, owner, then its modification time or its first bytes.
 type Stamp = (u64, u64, u64, u32, [u8; 16]);
 
 fn stamp(path: &Path) -> Option<Stamp> {
     let m = std::fs::symlink_metadata(path).ok()?;
     let mut mark = [0u8; 16];
     if path.starts_with(FOLDER) {
-        // Shorter, or not to be read: then it is known by a head of zeros, which a sound segment has not.
+        // A segment that is too short or unreadable gets zeros, which no intact segment starts with.
         let head = std::fs::File::open(path).and_then(|f| f.read_exact_at(&mut mark[..HEAD], 0));
         if head.is_err() {
             mark = [0; 16];
@@ -33,16 +33,16 @@ fn stamp(path: &Path) -> Option<Stamp> {
     Some((m.dev(), m.ino(), m.size(), m.uid(), mark))
 }
 
-/// What happened to a file.
+/// A watched file that was deleted or changed.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Damage {
-    /// Which.
+    /// The file.
     pub path: PathBuf,
     /// `is gone` or `was changed`.
     pub what: &'static str,
 }
 
-/// The watched files, as they were.
+/// The watched files and their identities when the watch began.
 #[derive(Debug, Default)]
 pub struct Vital {
     files: BTreeMap<PathBuf, Stamp>,
@@ -53,12 +53,12 @@ fn list(folder: &Path) -> Vec<PathBuf> {
 }
 
 impl Vital {
-    /// Everything of this process's node that lasts as long as it does: its own files, the services it has opened, the
-    /// data of its ports, the node counter; and `more`. Call it when all ports are made. Ordinary threads only.
+    /// Watches all files of this process's node (its own, the services it has opened, the data of its ports, the node
+    /// counter) and `more`. Call it when all ports exist, on an ordinary thread: it reads folders and files.
     pub fn of(node: &ShmNode, more: &[PathBuf]) -> Vital {
         let (names, number) = (node.names(), node.number());
         let own = list(&names.root().join("nodes").join(&number));
-        // `<prefix><number>.port_tag` and `<prefix><hash>.service_tag` say which ports and services are ours.
+        // `<prefix><number>.port_tag` and `<prefix><hash>.service_tag` name the ports and services of this node.
         let tags = |kind: &str| -> Vec<String> {
             let names = own.iter().filter(|p| p.extension().is_some_and(|e| e == kind));
             names.filter_map(|p| p.file_stem()?.to_str()?.strip_prefix(names_prefix(node)).map(str::to_owned)).collect()
@@ -85,12 +85,12 @@ impl Vital {
         Vital { files: files.filter_map(|p| stamp(&p).map(|s| (p, s))).collect() }
     }
 
-    /// How many files are watched.
+    /// Number of watched files.
     pub fn count(&self) -> usize {
         self.files.len()
     }
 
-    /// The first file that is not what it was.
+    /// The first file that was deleted or changed, if any.
     pub fn damage(&self) -> Option<Damage> {
         self.files.iter().find_map(|(path, was)| match stamp(path) {
             Some(now) if now == *was => None,
@@ -104,7 +104,7 @@ fn names_prefix(node: &ShmNode) -> &str {
     node.names().prefix()
 }
 
-/// Segments that this process has mapped, by their names in `/dev/shm`.
+/// Paths of the segments that this process has mapped.
 fn mapped_segments() -> Vec<PathBuf> {
     let maps = std::fs::read_to_string("/proc/self/maps").unwrap_or_default();
     let paths = maps.lines().filter_map(|l| l.find(FOLDER).map(|at| PathBuf::from(&l[at..])));

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 #[test]
-fn a_verb_is_heard_once_and_answered() {
+fn a_request_is_received_once_and_answered() {
     let place = Place::new();
     let server_node = place.node("daemon");
     let client_node = place.node("client");
@@ -17,20 +17,20 @@ fn a_verb_is_heard_once_and_answered() {
     std::thread::scope(|scope| {
         scope.spawn(|| {
             let server = RequestServer::new(&server_node).unwrap();
-            let mut heard = Vec::new();
+            let mut received = Vec::new();
             while !done.load(Ordering::Relaxed) {
                 if let Some(r) = server.next().unwrap() {
                     let accept = r.verb != Verb::Servo;
-                    heard.push((r.verb, r.payload.len()));
-                    r.answer(accept, &format!("{{\"heard\":{}}}", heard.len()));
+                    received.push((r.verb, r.payload.len()));
+                    r.answer(accept, &format!("{{\"received\":{}}}", received.len()));
                 }
                 std::thread::sleep(Duration::from_millis(1));
             }
-            assert_eq!(heard, [(Verb::Status, 0), (Verb::Setpoint, 100_000), (Verb::Servo, 0)]);
+            assert_eq!(received, [(Verb::Status, 0), (Verb::Setpoint, 100_000), (Verb::Servo, 0)]);
         });
         let client = RequestClient::new(&client_node).unwrap();
         let ask = |verb, payload: &[u8]| client.ask(verb, payload, now_ns(), Duration::from_secs(5)).unwrap();
-        assert_eq!(ask(Verb::Status, b""), Answer { accepted: true, json: "{\"heard\":1}".into() });
+        assert_eq!(ask(Verb::Status, b""), Answer { accepted: true, json: "{\"received\":1}".into() });
         assert!(ask(Verb::Setpoint, &vec![b'x'; 100_000]).accepted);
         assert!(!ask(Verb::Servo, b"").accepted);
         let long = client.ask(Verb::Setpoint, &vec![0; REQUEST_MAX_BYTES + 1], now_ns(), Duration::from_secs(1));
@@ -40,7 +40,7 @@ fn a_verb_is_heard_once_and_answered() {
 }
 
 #[test]
-fn without_a_daemon_the_client_says_so_in_time() {
+fn without_a_daemon_the_client_times_out() {
     let place = Place::new();
     let node = place.node("client");
     let client = RequestClient::new(&node).unwrap();
@@ -59,7 +59,7 @@ fn a_second_daemon_in_one_cell_is_refused() {
 }
 
 #[test]
-fn telemetry_arrives_whole() {
+fn telemetry_arrives_complete() {
     let place = Place::new();
     let (a, b) = (place.node("daemon"), place.node("console"));
     let publisher = TelemetryPublisher::new(&a).unwrap();

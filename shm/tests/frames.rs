@@ -1,4 +1,4 @@
-//! The frame topic between a publisher and a subscriber: order, loss, lies, restarts.
+//! The frame topic between a publisher and a subscriber: order, loss, false headers, restarts.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod common;
@@ -29,7 +29,7 @@ fn send(p: &mut FramePublisher, value: u8) -> u64 {
 }
 
 #[test]
-fn the_newest_pair_wins_and_losses_are_counted() {
+fn the_newest_pair_is_delivered_and_losses_are_counted() {
     let place = Place::new();
     let (a, b) = (place.node("publisher"), place.node("subscriber"));
     let mut p = FramePublisher::new(&a, geometry()).unwrap();
@@ -43,7 +43,7 @@ fn the_newest_pair_wins_and_losses_are_counted() {
     assert_eq!((f.sequence(), f.width(), f.height()), (1, W as usize, H as usize));
     assert!(f.mono8(0).unwrap().iter().all(|v| *v == 7) && f.mono8(1).unwrap().iter().all(|v| *v == 0xf8));
 
-    // Seven more: the topic keeps two of them for a slow reader, who takes the last and counts the rest.
+    // Seven more: the topic keeps two of them for a slow reader, which takes the last and counts the others.
     for k in 0..7 {
         send(&mut p, k);
     }
@@ -52,7 +52,7 @@ fn the_newest_pair_wins_and_losses_are_counted() {
     assert_eq!(got.frame.unwrap().sequence(), 8);
     assert_eq!((s.stats().missed, s.stats().superseded), (5, 1));
 
-    // A pair that the driver lost itself is a gap as well.
+    // A pair that the driver lost is a gap as well.
     p.skip();
     send(&mut p, 1);
     let got = s.newest(now_ns());
@@ -61,7 +61,7 @@ fn the_newest_pair_wins_and_losses_are_counted() {
 }
 
 #[test]
-fn every_lie_is_refused_under_its_own_name() {
+fn every_false_header_is_refused_with_its_own_error() {
     let place = Place::new();
     let (a, b) = (place.node("publisher"), place.node("subscriber"));
     let mut p = FramePublisher::new(&a, geometry()).unwrap();
@@ -77,61 +77,61 @@ fn every_lie_is_refused_under_its_own_name() {
     assert!(s.newest(now_ns()).frame.is_some());
 
     type Edit = fn(&mut StereoHeader);
-    let lies: [(Reject, Edit); 26] = [
-        (Reject::Magic, |h| h.magic ^= 1),
-        (Reject::Version, |h| h.layout_version = 2),
-        (Reject::HeaderSize, |h| h.header_size = 128),
-        (Reject::Torn, |h| h.sequence_end -= 1),
-        (Reject::Format, |h| h.pixel_format = 0),
-        (Reject::Format, |h| h.pixel_format = 99),
-        (Reject::Size, |h| h.width = 0),
-        (Reject::Size, |h| h.width = 1 << 31),
-        (Reject::Size, |h| h.height = u32::MAX),
-        (Reject::Size, |h| h.height -= 1),
-        (Reject::Stride, |h| h.stride = W - 1),
-        (Reject::Stride, |h| h.stride = u32::MAX),
-        (Reject::Bounds, |h| h.stride += 1),
-        (Reject::Bounds, |h| h.offset[1] += 1),
-        (Reject::Bounds, |h| h.offset[1] = u64::MAX - 5),
-        (Reject::Bounds, |h| h.size[0] = u64::MAX),
-        (Reject::Bounds, |h| h.size[1] = 10),
-        (Reject::Overlap, |h| h.offset[1] = 5),
-        (Reject::Incomplete, |h| h.flags = flags::INCOMPLETE_RIGHT),
-        (Reject::Future, |h| h.capture_ns[1] += 3_600_000_000_000),
-        (Reject::Future, |h| h.capture_ns[0] = 0),
-        (Reject::Stale, |h| h.capture_ns = h.capture_ns.map(|t| t - 1_500_000_000)),
-        (Reject::Skew, |h| h.capture_ns[0] -= 8_000_000),
-        (Reject::Sequence, |h| (h.sequence, h.sequence_end) = (1, 1)),
-        (Reject::Cameras, |h| h.camera_id.swap(0, 1)),
-        (Reject::Calibration, |h| h.calibration_id = id_hash("other")),
+    let edits: [(FrameError, Edit); 26] = [
+        (FrameError::Magic, |h| h.magic ^= 1),
+        (FrameError::Version, |h| h.layout_version = 2),
+        (FrameError::HeaderSize, |h| h.header_size = 128),
+        (FrameError::Torn, |h| h.sequence_end -= 1),
+        (FrameError::Format, |h| h.pixel_format = 0),
+        (FrameError::Format, |h| h.pixel_format = 99),
+        (FrameError::Size, |h| h.width = 0),
+        (FrameError::Size, |h| h.width = 1 << 31),
+        (FrameError::Size, |h| h.height = u32::MAX),
+        (FrameError::Size, |h| h.height -= 1),
+        (FrameError::Stride, |h| h.stride = W - 1),
+        (FrameError::Stride, |h| h.stride = u32::MAX),
+        (FrameError::Bounds, |h| h.stride += 1),
+        (FrameError::Bounds, |h| h.offset[1] += 1),
+        (FrameError::Bounds, |h| h.offset[1] = u64::MAX - 5),
+        (FrameError::Bounds, |h| h.size[0] = u64::MAX),
+        (FrameError::Bounds, |h| h.size[1] = 10),
+        (FrameError::Overlap, |h| h.offset[1] = 5),
+        (FrameError::Incomplete, |h| h.flags = flags::INCOMPLETE_RIGHT),
+        (FrameError::Future, |h| h.capture_ns[1] += 3_600_000_000_000),
+        (FrameError::Future, |h| h.capture_ns[0] = 0),
+        (FrameError::Stale, |h| h.capture_ns = h.capture_ns.map(|t| t - 1_500_000_000)),
+        (FrameError::Skew, |h| h.capture_ns[0] -= 8_000_000),
+        (FrameError::Sequence, |h| (h.sequence, h.sequence_end) = (1, 1)),
+        (FrameError::Cameras, |h| h.camera_id.swap(0, 1)),
+        (FrameError::Calibration, |h| h.calibration_id = id_hash("other")),
     ];
     let mut before = s.stats().rejected;
-    for (k, (want, edit)) in lies.into_iter().enumerate() {
+    for (k, (want, edit)) in edits.into_iter().enumerate() {
         p.loan().unwrap().send_with(&stamp(), edit).unwrap();
         let got = s.newest(now_ns());
-        assert!(got.frame.is_none(), "lie {k}");
-        assert_eq!(got.last_reject, Some(want), "lie {k}");
+        assert!(got.frame.is_none(), "edit {k}");
+        assert_eq!(got.last_error, Some(want), "edit {k}");
         before[want as usize] += 1;
-        assert_eq!(s.stats().rejected, before, "lie {k}");
+        assert_eq!(s.stats().rejected, before, "edit {k}");
     }
-    // A stamp that stands still while the sequence counts.
+    // A stamp that repeats while the sequence number advances.
     let st = stamp();
     p.loan().unwrap().send(&st).unwrap();
     assert!(s.newest(now_ns()).frame.is_some());
     p.loan().unwrap().send(&st).unwrap();
-    assert_eq!(s.newest(now_ns()).last_reject, Some(Reject::Order));
-    // After all that a good frame is still a good frame.
+    assert_eq!(s.newest(now_ns()).last_error, Some(FrameError::Order));
+    // A good frame is still accepted afterwards.
     send(&mut p, 3);
     assert!(s.newest(now_ns()).frame.is_some());
 }
 
 #[test]
-fn random_headers_never_get_past_the_payload() {
+fn random_headers_never_read_beyond_the_payload() {
     use proptest::prelude::*;
     let header = proptest::collection::vec(any::<u64>(), 24);
     proptest!(ProptestConfig::with_cases(2000), |(words in header, keep in any::<u32>(), len in 0usize..5000)| {
         let payload = vec![0u8; len];
-        // Some fields right, the rest noise, so that every check is reached.
+        // Some fields are valid and the others random, so that every check is reached.
         let small = |w: u64| (w % 80) as u32;
         let mut h = StereoHeader {
             sequence: words[0],
@@ -169,11 +169,11 @@ fn a_second_publisher_is_refused_while_the_first_lives_and_accepted_after() {
     assert_eq!(s.newest(now_ns()).source, Some(SourceEvent::First));
     send(&mut two, 2);
     let got = s.newest(now_ns());
-    assert_eq!((got.source, got.last_reject), (Some(SourceEvent::SecondPublisher), Some(Reject::Foreign)));
+    assert_eq!((got.source, got.last_error), (Some(SourceEvent::SecondPublisher), Some(FrameError::Foreign)));
     assert!(got.frame.is_none());
     send(&mut one, 3);
     assert_eq!(s.newest(now_ns()).frame.unwrap().bytes(0)[0], 3);
-    // The first one goes quiet (here: time is an argument); the next frame of the other takes over.
+    // The first one is silent for 0.6 s (time is an argument); the next frame of the other takes over.
     drop(one);
     send(&mut two, 4);
     let got = s.newest(now_ns() + 600_000_000);
@@ -198,7 +198,7 @@ fn another_layout_is_refused_with_what_was_expected() {
     }
 }
 
-/// Not a test of its own: the child process that the next test kills.
+/// Not a test: the child process that the next test kills.
 #[test]
 #[ignore = "child process of the restart test"]
 fn child_publisher() {
@@ -216,7 +216,7 @@ fn child_publisher() {
 }
 
 #[test]
-fn a_killed_publisher_is_silence_and_its_successor_is_taken_up() {
+fn a_killed_publisher_is_silent_and_its_successor_is_accepted() {
     let place = Place::new();
     let node = place.node("subscriber");
     let mut s = FrameSubscriber::new(&node, FramePolicy { takeover_ns: 200_000_000, ..Default::default() }).unwrap();
@@ -241,14 +241,14 @@ fn a_killed_publisher_is_silence_and_its_successor_is_taken_up() {
         let _ = child.wait();
         assert!(came.is_some(), "round {round}: no frames from the publisher");
         assert_eq!(source, Some(if round == 0 { SourceEvent::First } else { SourceEvent::TakenOver }));
-        // What it had sent may still be read; then silence, which is no error.
+        // What it had sent may still be read. Then there is silence, and no error.
         std::thread::sleep(Duration::from_millis(250));
         while s.newest(now_ns()).frame.is_some() {}
         let got = s.newest(now_ns());
         assert!(got.frame.is_none() && !got.transport_error);
         node.clean_up();
     }
-    // Nothing piles up: at most the last child's segment is left beside the service's own.
+    // No segments accumulate: at most that of the last child is left, in addition to the service's own.
     let data = std::fs::read_dir("/dev/shm")
         .unwrap()
         .flatten()

@@ -1,4 +1,4 @@
-//! What another user could reach of the shared memory, and what its owner loses when files are taken away.
+//! Permissions of the shared memory, and detection of deleted or changed files.
 #![allow(clippy::unwrap_used)]
 
 mod common;
@@ -20,7 +20,7 @@ fn counter(place: &Place) -> PathBuf {
 }
 
 #[test]
-fn a_node_takes_the_private_segment() {
+fn a_node_uses_the_private_segment() {
     let place = Place::new();
     let node = place.node("first");
     let _server = RequestServer::new(&node).unwrap();
@@ -30,7 +30,7 @@ fn a_node_takes_the_private_segment() {
         let mode = std::fs::metadata(path).unwrap().permissions().mode() & 0o777;
         assert_eq!(mode & 0o077, 0, "{}: {mode:o}", path.display());
     }
-    // It is the one that iceoryx2 counts in: there is one, and a second node counts on.
+    // iceoryx2 uses this segment: there is only one, and a second node increments its counter.
     assert_eq!(all.iter().filter(|p| p.extension().is_some_and(|e| e == "global_mgmt")).count(), 1, "{all:?}");
     let count = || std::fs::read(counter(&place)).unwrap()[8];
     let before = count();
@@ -39,16 +39,16 @@ fn a_node_takes_the_private_segment() {
 }
 
 #[test]
-fn a_segment_open_to_others_or_full_of_garbage_is_replaced() {
+fn a_segment_open_to_others_or_with_garbage_is_replaced() {
     let place = Place::new();
     drop(place.node("first"));
     let path = counter(&place);
     let set = |mode| std::fs::set_permissions(&path, std::fs::Permissions::from_mode(mode)).unwrap();
-    let number = || std::fs::metadata(&path).unwrap().ino();
-    let before = number();
+    let inode = || std::fs::metadata(&path).unwrap().ino();
+    let before = inode();
     set(0o666);
     drop(place.node("second"));
-    assert_ne!(number(), before, "who had the old one open has nothing");
+    assert_ne!(inode(), before, "a process that has the old one open must not share the new one");
     assert_eq!(std::fs::metadata(&path).unwrap().mode() & 0o777, 0o600);
     for garbage in [vec![0xa5u8; 16], vec![], vec![7; 5000]] {
         std::fs::write(&path, &garbage).unwrap();
@@ -58,8 +58,8 @@ fn a_segment_open_to_others_or_full_of_garbage_is_replaced() {
 }
 
 #[test]
-fn what_is_deleted_cut_or_written_over_is_noticed_and_use_is_not() {
-    for harm in ["nothing", "delete", "cut", "write", "service"] {
+fn deleted_truncated_and_overwritten_files_are_reported_and_normal_use_is_not() {
+    for harm in ["nothing", "delete", "truncate", "write", "service"] {
         let place = Place::new();
         let node = place.node("daemon");
         let server = RequestServer::new(&node).unwrap();
@@ -68,16 +68,16 @@ fn what_is_deleted_cut_or_written_over_is_noticed_and_use_is_not() {
         std::fs::write(&more, "1").unwrap();
         let vital = Vital::of(&node, &[more]);
         assert!(vital.count() >= 9, "{vital:?}");
-        // Other programs come, ask and go.
+        // Other programs connect, send a request and end.
         for _ in 0..3 {
             let guest = place.node("guest");
             let client = graspd_shm::control::RequestClient::new(&guest).unwrap();
             let asked = client.ask(graspd_shm::control::Verb::Status, b"", 0, Duration::from_millis(5));
-            assert!(asked.is_err(), "nobody answers here");
+            assert!(asked.is_err(), "this test does not answer");
             let _ = server.next().unwrap();
             telemetry.publish(&TelemetrySample::default()).unwrap();
         }
-        // Many at once: they write into pages of the services that nobody has touched before.
+        // Many at a time: they write to pages of the services that were never written before.
         let guests: Vec<_> = (0..12).map(|_| place.node("guest")).collect();
         let clients: Vec<_> = guests.iter().map(|g| graspd_shm::control::RequestClient::new(g).unwrap()).collect();
         std::thread::sleep(Duration::from_millis(20));
@@ -87,7 +87,7 @@ fn what_is_deleted_cut_or_written_over_is_noticed_and_use_is_not() {
         let victim = segments(&place).into_iter().find(|p| p.extension().is_some_and(|e| e == "dynamic")).unwrap();
         match harm {
             "delete" => std::fs::remove_file(&victim).unwrap(),
-            "cut" => std::fs::File::options().write(true).open(&victim).unwrap().set_len(4096 * 8).unwrap(),
+            "truncate" => std::fs::File::options().write(true).open(&victim).unwrap().set_len(4096 * 8).unwrap(),
             "write" => std::fs::File::options()
                 .write(true)
                 .open(counter(&place))

@@ -1,4 +1,5 @@
-//! The documented layout, proved by a publisher in another language: `python/publish_stereo.py` in a fresh virtual environment.
+//! The documented layout, tested with a publisher in another language: `python/publish_stereo.py` in a virtual
+//! environment.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod common;
@@ -9,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Runs a command for at most `limit`; its standard error on failure.
+/// Runs a command for at most `limit`; returns its standard error on failure.
 fn run(mut c: Command, limit: Duration) -> Result<(), String> {
     let mut child = c.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().map_err(|e| e.to_string())?;
     let end = Instant::now() + limit;
@@ -88,13 +89,13 @@ fn a_python_driver_feeds_the_subscriber() {
         gaps += got.skipped;
         if let Some(f) = got.frame {
             let k = f.sequence() % 8;
-            for eye in 0..2 {
-                let p = f.mono8(eye).unwrap();
+            for view in 0..2 {
+                let p = f.mono8(view).unwrap();
                 for (x, y) in [(0, 0), (319, 0), (0, 239), (319, 239), (100, 77)] {
-                    assert_eq!(u64::from(p[y * 320 + x]), (x as u64 + y as u64 + 3 * k + 50 * eye as u64) & 0xff);
+                    assert_eq!(u64::from(p[y * 320 + x]), (x as u64 + y as u64 + 3 * k + 50 * view as u64) & 0xff);
                 }
             }
-            assert_ne!(f.sequence() % 10, 0, "a pair that the driver dropped on purpose");
+            assert_ne!(f.sequence() % 10, 0, "a pair that the driver dropped");
             good += 1;
         }
         (good >= 60).then_some(())
@@ -103,5 +104,5 @@ fn a_python_driver_feeds_the_subscriber() {
     let _ = child.wait();
     assert!(done.is_some(), "only {good} frames; {:?}", s.stats());
     assert_eq!(s.stats().rejected_total(), 0, "{:?}", s.stats());
-    assert!(gaps >= 5, "the dropped pairs must show as gaps");
+    assert!(gaps >= 5, "dropped pairs must be counted as gaps");
 }

@@ -111,7 +111,7 @@ impl<'a> CommandWorker<'a> {
         }
         let setpoint = self.shared.setpoint.take();
         let request = if self.shared.live.take() {
-            Some(graspd_rt::cycle::Request { id: 0, kind: graspd_rt::cycle::RequestKind::Stop })
+            Some(graspd_rt::cycle::CommandRequest { id: 0, kind: graspd_rt::cycle::RequestKind::Stop })
         } else {
             self.shared.requests.pop()
         };

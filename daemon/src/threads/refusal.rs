@@ -1,13 +1,13 @@
 //! Why the vision thread refused a pair: one number across threads, words for people.
 
 use graspd_rt::online::FrameReject;
-use graspd_shm::frame::Reject;
+use graspd_shm::frame::FrameError;
 
 /// Why a pair was refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refusal {
     /// By the checks of the frame topic.
-    Topic(Reject),
+    Topic(FrameError),
     /// By the tracker.
     Tracker(FrameReject),
     /// Its payload does not hold the images that its header promises.
@@ -56,7 +56,7 @@ impl Refusal {
             IMAGES => "the payload does not hold the images that the header promises".to_owned(),
             FROZEN => "the image repeats while the arm moves: the camera or its driver is frozen".to_owned(),
             n => {
-                let topic = n.checked_sub(1).and_then(|i| Reject::ALL.get(i as usize)).map(ToString::to_string);
+                let topic = n.checked_sub(1).and_then(|i| FrameError::ALL.get(i as usize)).map(ToString::to_string);
                 let tracker = n.checked_sub(100).and_then(|i| TRACKER.get(i as usize)).map(|w| (*w).to_owned());
                 topic.or(tracker).unwrap_or_else(|| format!("reason {n}"))
             }
@@ -71,7 +71,7 @@ mod tests {
     #[test]
     fn every_refusal_has_words_of_its_own() {
         let mut seen = std::collections::BTreeSet::new();
-        let topic = Reject::ALL.map(Refusal::Topic);
+        let topic = FrameError::ALL.map(Refusal::Topic);
         let tracker = [
             FrameReject::Sequence { last: 1, got: 1 },
             FrameReject::Skew { ns: 1 },
@@ -85,7 +85,7 @@ mod tests {
             assert!(words.len() > 10 && !words.starts_with("reason"), "{r:?}: {words}");
             seen.insert(r.number());
         }
-        assert_eq!(seen.len(), Reject::ALL.len() + 7);
+        assert_eq!(seen.len(), FrameError::ALL.len() + 7);
         assert_eq!(Refusal::words(0), "");
     }
 }

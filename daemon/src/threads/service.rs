@@ -11,7 +11,7 @@ use crate::log;
 use crate::realtime::now_ns;
 use crate::stop::By;
 use graspd_calib::files::PlanFile;
-use graspd_rt::cycle::{Request as CycleRequest, RequestKind};
+use graspd_rt::cycle::{CommandRequest, RequestKind};
 use graspd_rt::mode::{ModeName, Reject};
 use graspd_rt::setpoint::SetPoint;
 use graspd_shm::control::{Request, RequestServer, Verb};
@@ -121,7 +121,7 @@ impl Service<'_> {
         while self.shared.replies.pop().is_some() {}
         self.shared
             .requests
-            .push(CycleRequest { id, kind })
+            .push(CommandRequest { id, kind })
             .map_err(|_| "the command thread does not take requests".to_owned())?;
         let until = Instant::now() + ANSWER_WITHIN;
         while Instant::now() < until {

@@ -7,7 +7,7 @@ use crate::log;
 use crate::stop::Live;
 use crossbeam::queue::ArrayQueue;
 use graspd_rt::arm::Joints;
-use graspd_rt::cycle::{Reply, Request};
+use graspd_rt::cycle::{CommandRequest, Reply};
 use graspd_rt::geom::Pose;
 use graspd_rt::mode::Reject;
 use graspd_rt::online::Vision;
@@ -79,7 +79,7 @@ pub struct Shared {
     /// Command to service: the answer to an offered set-point.
     pub setpoint_reply: Slot<Result<(), Reject>>,
     /// Service to command: requests, one taken a cycle.
-    pub requests: ArrayQueue<Request>,
+    pub requests: ArrayQueue<CommandRequest>,
     /// Command to service: answers.
     pub replies: ArrayQueue<Reply>,
     /// The stop latch, ahead of every queued request, and what the last cycle did.

@@ -101,7 +101,7 @@ impl<'a> VisionWorker<'a> {
         let received = subscriber.newest(now);
         let counters = &shared.counters;
         counters.skipped.fetch_add(received.skipped, Ordering::Relaxed);
-        if let Some(reject) = received.last_reject {
+        if let Some(reject) = received.last_error {
             counters.refused.fetch_add(u64::from(received.rejected), Ordering::Relaxed);
             counters.refusal.store(Refusal::Topic(reject).number(), Ordering::Relaxed);
         }

@@ -12,7 +12,7 @@ use graspd::realtime::now_ns;
 use graspd_hil::controller::{Command, Port, Robot, Server, Setup, World};
 use graspd_rt::arm::{Dh, Joints, Model, READY};
 use graspd_rt::cycle::{
-    CommandCycle, CommandInput, CommandOutput, CycleConfig, CycleSettings, LinkStatus, Request, RequestKind,
+    CommandCycle, CommandInput, CommandOutput, CommandRequest, CycleConfig, CycleSettings, LinkStatus, RequestKind,
 };
 use graspd_rt::geom::{Camera, Distortion, Pose, Rig, Twist, Vec3, View, exp_twist};
 use graspd_rt::gripper::{Gripper, MAX_MARKS, Mark};
@@ -201,7 +201,7 @@ impl Cell {
             robot,
             link: self.status,
             vision: vision.as_ref(),
-            request: request.map(|kind| Request { id: 1, kind }),
+            request: request.map(|kind| CommandRequest { id: 1, kind }),
             setpoint: offer.then_some(&self.setpoint),
             internal_fault: false,
         });

@@ -1,4 +1,5 @@
-//! Inverse kinematics: closed form of the designed geometry, then a bounded Newton iteration on the unit's own table.
+//! Inverse kinematics: the closed form of the nominal geometry, then a bounded Newton iteration on the calibrated
+//! table.
 
 use super::{Dh, Joints};
 use crate::geom::{Pose, Vec3, log_pose};
@@ -9,33 +10,34 @@ use nalgebra::{Matrix6, Vector6};
 /// Why a pose has no joint positions.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum InverseError {
-    /// The pose, the table or the start is not made of finite numbers.
+    /// A value of the pose, the table or the start is not finite.
     NotFinite,
-    /// The pose lies outside the arm's reach (or inside its column).
+    /// The pose is beyond the arm's reach, or too close to the axis of the base.
     OutOfReach,
-    /// The iteration ended with this distance (m) and angle (rad) still to go: at or next to a singularity.
+    /// The iteration did not converge: at or next to a singularity.
     NotConverged {
-        /// Distance to the asked position, metres.
+        /// Remaining distance to the requested position, metres.
         position: f64,
-        /// Angle to the asked orientation, rad.
+        /// Remaining angle to the requested orientation, rad.
         angle: f64,
     },
 }
 
-/// Newton steps at most; from a closed-form start of a calibrated unit three suffice.
+/// Most Newton steps; from the closed form of a calibrated unit, three suffice.
 const STEPS: usize = 30;
-/// Distance (m) and angle (rad) at which a solution counts.
+/// Distance (m) and angle (rad) below which the iteration has converged.
 const TOLERANCE: f64 = 1e-9;
-/// How far a cosine may overshoot 1 for a start to be worth an iteration: a calibrated unit reaches a little further than its design.
+/// How far a cosine may exceed 1 for a start to be worth an iteration: a calibrated unit may reach farther than the
+/// nominal one.
 const CALIBRATION_SLACK: f64 = 1e-2;
 
-/// Joint positions that put the flange at `base_from_flange`, of all branches the one nearest to `near` (rad).
+/// Joint positions that put the flange at `base_from_flange`: of all branches the one nearest to `near` (rad).
 ///
-/// The closed form of the table's main lengths gives up to eight starts, `near` is one more, and Newton's iteration on the
-/// whole table finishes each. Work is bounded: at most nine starts of 30 steps.
+/// The closed form of the table's main lengths gives up to eight starts, and `near` is one more. Newton's iteration on
+/// the complete table refines each. Bounded work: at most nine starts of 30 steps.
 ///
 /// # Errors
-/// [`InverseError`]: nothing in reach, or no start converged.
+/// [`InverseError`]: out of reach, or no start converged.
 pub fn inverse(dh: &Dh, base_from_flange: &Pose, near: &Joints) -> Result<Joints, InverseError> {
     let finite = dh.is_finite() && pose_is_finite(base_from_flange) && near.iter().all(|v| v.is_finite());
     if !finite {
@@ -63,10 +65,10 @@ pub fn inverse(dh: &Dh, base_from_flange: &Pose, near: &Joints) -> Result<Joints
     best.map(|(_, q)| q).ok_or(last)
 }
 
-/// Newton's iteration from `start` only: the same branch, for a pose close to the present one.
+/// Newton's iteration from `start` only: stays on its branch, for a pose close to that of `start`.
 ///
 /// # Errors
-/// [`InverseError::NotConverged`] after 30 steps, [`InverseError::NotFinite`] for absurd input.
+/// [`InverseError::NotConverged`] after 30 steps, [`InverseError::NotFinite`] for input that is not finite.
 pub fn newton(dh: &Dh, base_from_flange: &Pose, start: &Joints) -> Result<Joints, InverseError> {
     let mut q = *start;
     let mut e = Vector6::zeros();
@@ -82,7 +84,7 @@ pub fn newton(dh: &Dh, base_from_flange: &Pose, start: &Joints) -> Result<Joints
             break;
         }
         let j = dh.body_jacobian(&q, &Pose::identity());
-        // Damping falls with the error, so that the end is quadratic away from singularities and calm next to them.
+        // Damping decreases with the error: quadratic convergence away from singularities, bounded steps next to them.
         let damping = 1e-6 * e.norm_squared() + 1e-14;
         let Some(c) = (j * j.transpose() + Matrix6::identity() * damping).cholesky() else { break };
         let mut d = j.transpose() * c.solve(&e);
@@ -98,13 +100,13 @@ pub fn newton(dh: &Dh, base_from_flange: &Pose, start: &Joints) -> Result<Joints
     Err(InverseError::NotConverged { position, angle: e.fixed_rows::<3>(3).norm() })
 }
 
-/// All branches of the designed geometry (alpha at quarter turns, a and d where UR's design has them); the table's other
-/// entries are ignored. `wrist3` is used where wrist 2 is straight and leaves wrist 3 free. At most eight.
+/// All branches of the nominal geometry, at most eight: alpha at quarter turns, a and d where UR's design has them.
+/// Other entries of the table are ignored. `wrist3` (rad) is used where wrist 2 is straight, which leaves wrist 3 free.
 pub fn closed_form(dh: &Dh, base_from_flange: &Pose, wrist3: f64) -> heapless::Vec<Joints, 8> {
     branches(dh, base_from_flange, wrist3, 1e-12)
 }
 
-/// As [`closed_form`], where a cosine may overshoot 1 by `slack`.
+/// As [`closed_form`], where a cosine may exceed 1 by `slack`.
 fn branches(dh: &Dh, base_from_flange: &Pose, wrist3: f64, slack: f64) -> heapless::Vec<Joints, 8> {
     let mut out = heapless::Vec::new();
     let r = base_from_flange.rotation.to_rotation_matrix();
@@ -127,7 +129,7 @@ fn branches(dh: &Dh, base_from_flange: &Pose, wrist3: f64, slack: f64) -> heaple
                 let sign = if s5 > 0.0 { 1.0 } else { -1.0 };
                 math::atan2(sign * (-r.m12 * s1 + r.m22 * c1), sign * (r.m11 * s1 - r.m21 * c1))
             };
-            // Frame 4 in frame 1: what is left for the three parallel axes.
+            // Frame 4 in frame 1: the motion of the three parallel axes.
             let tail = single(0.0, d5, -FRAC_PI_2, q5) * single(0.0, d6, 0.0, q6);
             let f1_from_f4 = single(0.0, d1, FRAC_PI_2, q1).inverse() * base_from_flange * tail.inverse();
             let t = f1_from_f4.translation.vector;
@@ -142,7 +144,7 @@ fn branches(dh: &Dh, base_from_flange: &Pose, wrist3: f64, slack: f64) -> heaple
                 let q4 = math::atan2(x4.y, x4.x) - q2 - q3;
                 let q = [q1, q2, q3, q4, q5, q6];
                 if q.iter().all(|v| v.is_finite()) {
-                    // Eight branches, eight places.
+                    // Cannot fail: eight branches, capacity eight.
                     let _ = out.push(core::array::from_fn(|i| q[i] - dh.theta[i]));
                 }
             }
@@ -167,7 +169,7 @@ fn single(a: f64, d: f64, alpha: f64, q: f64) -> Pose {
     Pose::from_parts(nalgebra::Translation3::new(a * math::cos(q), a * math::sin(q), d), z * x)
 }
 
-/// acos with the argument allowed to overshoot by `slack`; `None` beyond.
+/// acos of an argument that may exceed its range by `slack`; `None` beyond.
 fn acos_in_range(c: f64, slack: f64) -> Option<f64> {
     (math::fabs(c) <= 1.0 + slack).then(|| math::acos(c.clamp(-1.0, 1.0)))
 }
@@ -233,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn calibrated_units_come_back_to_where_they_were() {
+    fn calibrated_units_round_trip() {
         let delta = Dh {
             a: [1e-4, 5e-4, -4e-4, 2e-5, -3e-5, 0.0],
             d: [2e-4, 0.3, -0.3, 1e-4, 1e-4, 2e-4],
@@ -253,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn out_of_reach_and_nonsense_are_refused() {
+    fn out_of_reach_and_not_finite_are_refused() {
         let dh = Dh::nominal(Model::Ur5e);
         assert_eq!(inverse(&dh, &Pose::translation(2.0, 0.0, 0.5), &READY), Err(InverseError::OutOfReach));
         assert_eq!(inverse(&dh, &Pose::translation(f64::NAN, 0.0, 0.5), &READY), Err(InverseError::NotFinite));

@@ -5,19 +5,19 @@ use crate::geom::{Pose, Vec3};
 use nalgebra::{Matrix6, Vector6};
 
 impl Dh {
-    /// Speed (m/s) of the point at `offset` in the flange's frame (m and rotation vector, as UR writes it) at joint
-    /// rates `qd`.
+    /// Speed (m/s) of the point at `offset` in the flange frame (UR's pose: metres and rotation vector) at joint
+    /// positions `q` (rad) and joint rates `qd` (rad/s).
     pub fn tool_speed(&self, q: &Joints, qd: &Joints, offset: &[f64; 6]) -> f64 {
         let xi = self.body_jacobian(q, &pose_from_ur(offset)) * Vector6::from_column_slice(qd);
         crate::math::sqrt(xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2])
     }
 
-    /// Body Jacobian at the gripper: `xi = J(q) qd`, where `xi = [v; w]` (m/s, rad/s) is the screw of the gripper relative to the
-    /// base, of the point at the gripper's origin, expressed in the gripper frame.
+    /// Body Jacobian at the gripper: `xi = J(q) qd`, where `xi = [v; w]` (m/s, rad/s) is the screw of the gripper
+    /// relative to the base, of the point at the gripper's origin, expressed in the gripper frame.
     ///
-    /// Column i is the screw of joint i alone: its axis `z` through `o` gives `w = R^T z`, `v = R^T (z x (p - o))`, with `R` and
-    /// `p` the gripper's rotation and origin in the base. It has to agree with finite differences of
-    /// [`Dh::gripper_motion`], and a test holds it to that.
+    /// Column i is the screw of joint i alone: its axis `z` through `o` gives `w = R^T z`, `v = R^T (z x (p - o))`,
+    /// with `R` and `p` the gripper's rotation and origin in the base. A test compares it with finite differences of
+    /// [`Dh::gripper_motion`].
     pub fn body_jacobian(&self, q: &Joints, flange_from_gripper: &Pose) -> Matrix6<f64> {
         let frames = self.frames(q);
         let base_from_gripper = frames[6] * flange_from_gripper;

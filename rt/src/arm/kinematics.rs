@@ -1,47 +1,14 @@
 //! Forward kinematics by a Denavit-Hartenberg table, nominal or a unit's own.
 
-use super::{Joints, Model};
+use super::{Dh, Joints, Model};
 use crate::geom::{Pose, Vec3};
 use crate::math;
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
-
-/// Denavit-Hartenberg table, standard convention: frame i follows frame i-1 by a turn of `q + theta` about z, `d` along z, `a`
-/// along the new x and a turn of `alpha` about it.
-///
-/// The base frame is UR's own (the pendant's "Base"), without the half turn of the URDF's `base_link`. A calibrated unit has
-/// small offsets in all of the columns; `d` of joints 2 and 3 may be large and opposite in it, which is meant so.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Dh {
-    /// Link lengths, metres.
-    pub a: [f64; 6],
-    /// Link offsets, metres.
-    pub d: [f64; 6],
-    /// Link twists, rad.
-    pub alpha: [f64; 6],
-    /// Offsets added to the joint angles, rad.
-    pub theta: [f64; 6],
-}
 
 impl Dh {
     /// The table of a model as designed.
     pub const fn nominal(model: Model) -> Self {
         model.dh()
-    }
-
-    /// This table with another added entry by entry: nominal plus a unit's calibration deltas.
-    pub fn plus(&self, delta: &Dh) -> Self {
-        let add = |x: &[f64; 6], y: &[f64; 6]| core::array::from_fn(|i| x[i] + y[i]);
-        Self {
-            a: add(&self.a, &delta.a),
-            d: add(&self.d, &delta.d),
-            alpha: add(&self.alpha, &delta.alpha),
-            theta: add(&self.theta, &delta.theta),
-        }
-    }
-
-    /// Whether every entry is a finite number.
-    pub fn is_finite(&self) -> bool {
-        [&self.a, &self.d, &self.alpha, &self.theta].into_iter().flatten().all(|v| v.is_finite())
     }
 
     /// Frame i in frame i-1 for joint `i` (0 to 5) at angle `q`.
@@ -81,17 +48,17 @@ impl Dh {
         self.base_from_flange(q) * flange_from_gripper
     }
 
-    /// How the gripper moved between two sets of joint positions: its pose at `q_to` in its own frame at `q_from`.
+    /// Motion of the gripper between two sets of joint positions: its pose at `q_to` in its frame at `q_from`.
     ///
-    /// The base cancels, so this is all that prediction needs to know of the arm; an error of the table scales with the motion
-    /// and vanishes at rest.
+    /// The base cancels, so prediction needs nothing else of the arm. The effect of an error in the table scales with
+    /// the motion and vanishes at rest.
     pub fn gripper_motion(&self, q_from: &Joints, q_to: &Joints, flange_from_gripper: &Pose) -> Pose {
         self.base_from_gripper(q_from, flange_from_gripper).inverse()
             * self.base_from_gripper(q_to, flange_from_gripper)
     }
 }
 
-/// Rotation vector (axis times angle, rad, at most pi long) of a pose, as UR writes its `p[x,y,z,rx,ry,rz]`.
+/// Rotation vector (axis times angle, rad, length at most pi) of a pose, as in UR's `p[x,y,z,rx,ry,rz]`.
 pub fn rotation_vector(pose: &Pose) -> Vec3 {
     let q = pose.rotation.quaternion();
     let (w, u) = if q.w < 0.0 { (-q.w, -Vec3::new(q.i, q.j, q.k)) } else { (q.w, Vec3::new(q.i, q.j, q.k)) };
@@ -136,13 +103,13 @@ mod tests {
 
     #[test]
     fn at_zero_the_arm_is_stretched_along_minus_x() {
-        // UR's own image of the zero pose of a UR5e: flange at (a2+a3, -(d4+d6), d1-d5).
+        // UR's drawing of the zero position of a UR5e: flange at (a2+a3, -(d4+d6), d1-d5).
         let p = Dh::nominal(Model::Ur5e).base_from_flange(&[0.0; 6]).translation.vector;
         assert!((p - Vec3::new(-0.8172, -(0.1333 + 0.0996), 0.1625 - 0.0997)).norm() < 1e-12);
     }
 
     #[test]
-    fn motion_between_equal_positions_is_none_whatever_the_table() {
+    fn equal_positions_give_no_motion_with_any_table() {
         let mut dh = Dh::nominal(Model::Ur10e);
         dh.a[2] += 0.01;
         dh.alpha[4] -= 0.02;

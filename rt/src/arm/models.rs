@@ -1,7 +1,8 @@
 //! The Universal Robots arms that graspd knows: nominal geometry, joint ranges, joint speeds.
 //!
-//! Figures: UR's article "DH Parameters for calculations of kinematics and dynamics" and UR's ROS 2 description 2.4.5; where
-//! both give a number they agree. Old CB3 manuals print other revisions; a unit's own calibration overrides all of it.
+//! Sources: UR's article "DH Parameters for calculations of kinematics and dynamics" and UR's ROS 2 description 2.4.5,
+//! which agree where both state a value. Old CB3 manuals print other revisions; the calibration of a unit overrides all
+//! of it.
 
 use super::{Dh, Joints};
 use core::f64::consts::{FRAC_PI_2, TAU};
@@ -21,12 +22,12 @@ pub enum Model {
     Ur30,
 }
 
-/// What one joint of a model can do, as its maker states it; settings may lower it, never raise it.
+/// Range and speed of one joint as its manufacturer states them. Settings may lower them, never raise them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct JointRange {
-    /// Lowest position, rad; minus infinity for a joint that turns without end.
+    /// Lowest position, rad; minus infinity for a joint without an end.
     pub min: f64,
-    /// Highest position, rad; infinity for a joint that turns without end.
+    /// Highest position, rad; infinity for a joint without an end.
     pub max: f64,
     /// Highest speed, rad/s.
     pub speed: f64,
@@ -49,7 +50,7 @@ impl Model {
         Model::Ur30,
     ];
 
-    /// The model called `name` (`ur5e`, `UR5e`); `None` for a name that no model has.
+    /// The model named `name`, in upper or lower case (`ur5e`, `UR5e`); `None` for an unknown name.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|m| m.name().eq_ignore_ascii_case(name))
     }
@@ -109,21 +110,22 @@ impl Model {
         };
         let endless = matches!(self, Model::Ur3 | Model::Ur3e);
         let last = if endless { f64::INFINITY } else { TAU };
-        [turn(TAU, big), turn(TAU, big), turn(TAU, elbow), turn(TAU, wrist), turn(TAU, wrist), turn(last, wrist)]
+        [joint(TAU, big), joint(TAU, big), joint(TAU, elbow), joint(TAU, wrist), joint(TAU, wrist), joint(last, wrist)]
     }
 
-    /// Longest distance from the shoulder to the wrist's last axis crossing, metres: beyond it nothing is reachable.
+    /// Largest distance from the shoulder to the flange, metres: beyond it nothing is reachable.
     pub const fn reach(self) -> f64 {
         let [_, a2, a3, _, d5, d6] = self.lengths();
         -a2 - a3 + d5 + d6
     }
 }
 
-const fn turn(range: f64, degrees_a_second: f64) -> JointRange {
-    JointRange { min: -range, max: range, speed: degrees_a_second * (core::f64::consts::PI / 180.0) }
+const fn joint(range: f64, degrees_per_s: f64) -> JointRange {
+    JointRange { min: -range, max: range, speed: degrees_per_s * (core::f64::consts::PI / 180.0) }
 }
 
-/// A position in the middle of the workspace, elbow up and tool down, away from every singularity: where tests and the mock start.
+/// Joint positions in the middle of the workspace, elbow up, tool down, away from every singularity: the start of tests
+/// and of the mock arm, rad.
 pub const READY: Joints = [0.0, -1.6, 1.9, -1.87, -FRAC_PI_2, 0.0];
 
 #[cfg(test)]
@@ -131,7 +133,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_lead_back_to_their_models() {
+    fn names_round_trip() {
         for m in Model::ALL {
             assert_eq!(Model::from_name(m.name()), Some(m));
         }
@@ -141,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn every_joint_has_room_and_speed() {
+    fn joint_ranges_and_speeds_are_plausible() {
         for m in Model::ALL {
             for j in m.joints() {
                 assert!(j.max > 6.0 && j.min < -6.0 && j.speed > 2.0 && j.speed < 6.5, "{m:?}");

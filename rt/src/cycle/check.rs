@@ -1,4 +1,5 @@
-//! Looks down the way before the first step: marks in view, arm in reach, no singularity, all joints in range.
+//! Checks a set-point, and the path to it before the first step: marks in view, arm in reach, no singularity, joints in
+//! range.
 
 use super::settings::CycleConfig;
 use crate::arm::{Joints, newton};
@@ -10,12 +11,12 @@ use crate::online::path::Leg;
 use crate::online::rates::singularity;
 use crate::setpoint::{Goal, SetPoint};
 
-/// Poses looked at on each leg.
+/// Poses checked on each leg.
 const SAMPLES: u32 = 8;
-/// A mark this close to the border does not count, pixels.
+/// Distance from the image border below which a mark does not count, pixels.
 const MARGIN_PX: f64 = 8.0;
 
-/// Whether a set-point can be used at all: finite, and enough marks planned in the images in use.
+/// Whether a set-point is finite and has enough marks in the views in use.
 pub(super) fn setpoint(c: &CycleConfig, s: &SetPoint) -> Result<(), Reject> {
     for goal in [&s.pregrasp, &s.grasp] {
         if goal_points(c, goal, s.best_view)? < c.settings.law.min_points {
@@ -46,10 +47,11 @@ fn goal_points(c: &CycleConfig, goal: &Goal, best: View) -> Result<u8, Reject> {
     Ok(points)
 }
 
-/// Whether the way from `pose` (gripper in the rig now, joints `q`) over pre-grasp to grasp can be gone.
+/// Whether the path from `pose` (gripper in the rig now, joints `q`) over the pre-grasp to the grasp is possible.
 ///
-/// Only relative motion enters: the goal relative to where the gripper is. Work is bounded: 16 poses, each a few Newton steps.
-pub(super) fn way(c: &CycleConfig, limits: &Limits, pose: &Pose, q: &Joints, s: &SetPoint) -> Result<(), Reject> {
+/// Only the motion relative to the gripper's pose is needed, not the pose of the rig in the robot's base. Bounded work:
+/// 16 poses, each with a few Newton steps.
+pub(super) fn path(c: &CycleConfig, limits: &Limits, pose: &Pose, q: &Joints, s: &SetPoint) -> Result<(), Reject> {
     let mount = &c.gripper.flange_from_gripper;
     let base_from_left = c.dh.base_from_gripper(q, mount) * pose.inverse();
     let unmount = mount.inverse();
@@ -74,7 +76,7 @@ pub(super) fn way(c: &CycleConfig, limits: &Limits, pose: &Pose, q: &Joints, s: 
     Ok(())
 }
 
-/// Marks that face a camera in use and lie inside its image with the gripper at `pose`.
+/// Number of marks that face a camera in use and are inside its image with the gripper at `pose`.
 fn points(c: &CycleConfig, pose: &Pose, best: View) -> u8 {
     let mut n = 0;
     for view in View::BOTH {

@@ -1,8 +1,8 @@
-//! What the gripper holds, by the outputs that the controller really has: a restart remembers nothing, the outputs do.
+//! Whether the gripper is closed, from the controller's outputs: they persist when the daemon restarts.
 
 use super::settings::TaskSettings;
 
-/// The gripper by its outputs.
+/// State of the gripper by its outputs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Grip {
@@ -13,12 +13,12 @@ pub enum Grip {
     Open = 1,
     /// Its outputs are as closing sets them.
     Closed = 2,
-    /// Its outputs are as neither sets them, or nobody has seen them yet.
+    /// Its outputs are as neither sets them, or have not been read yet.
     Unknown = 3,
 }
 
 impl Grip {
-    /// In words, as the status verb writes it.
+    /// The text in the answer to `status`.
     pub const fn as_str(self) -> &'static str {
         match self {
             Grip::None => "no outputs configured",
@@ -29,34 +29,34 @@ impl Grip {
     }
 }
 
-/// How long after a command the outputs may still show the one before, ns: the way to the script and back, at 125 Hz
-/// three steps each.
+/// Time after a command in which the outputs may still show the command before it, ns: three steps at 125 Hz to the
+/// script, and three back.
 const SETTLE_NS: u64 = 100_000_000;
 
-/// What was told and what was seen.
+/// The last command and the outputs that were read.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Fingers {
-    /// The command that stands, and until when the outputs are not believed against it.
-    told: Option<(bool, u64)>,
+    /// The last command (`true` closes), and the time until which it counts more than the outputs, ns.
+    commanded: Option<(bool, u64)>,
     grip: Grip,
 }
 
 impl Fingers {
     pub(super) fn new(task: &TaskSettings) -> Self {
-        Self { told: None, grip: if task.has_outputs() { Grip::Unknown } else { Grip::None } }
+        Self { commanded: None, grip: if task.has_outputs() { Grip::Unknown } else { Grip::None } }
     }
 
-    /// A command is on its way.
-    pub(super) fn tell(&mut self, close: bool, now_ns: u64) {
-        self.told = Some((close, now_ns.saturating_add(SETTLE_NS)));
+    /// Notes a command.
+    pub(super) fn command(&mut self, close: bool, now_ns: u64) {
+        self.commanded = Some((close, now_ns.saturating_add(SETTLE_NS)));
         if self.grip != Grip::None {
             self.grip = if close { Grip::Closed } else { Grip::Open };
         }
     }
 
-    /// The controller's outputs, as numbered by the script.
-    pub(super) fn see(&mut self, task: &TaskSettings, levels: u32, now_ns: u64) {
-        if self.told.is_none_or(|(_, until)| now_ns >= until) {
+    /// Takes the controller's outputs, numbered as by the script.
+    pub(super) fn observe(&mut self, task: &TaskSettings, levels: u32, now_ns: u64) {
+        if self.commanded.is_none_or(|(_, until)| now_ns >= until) {
             self.grip = task.grip(levels);
         }
     }
@@ -65,11 +65,10 @@ impl Fingers {
         self.grip
     }
 
-    /// Whether the arm would pull at what the gripper holds, as far as anybody knows. Without outputs only what was
-    /// told counts.
+    /// Whether the gripper may hold something. Without configured outputs the last command decides.
     pub(super) fn may_hold(&self) -> bool {
         match self.grip {
-            Grip::None => self.told.is_some_and(|(close, _)| close),
+            Grip::None => self.commanded.is_some_and(|(close, _)| close),
             Grip::Open => false,
             Grip::Closed | Grip::Unknown => true,
         }
@@ -82,10 +81,11 @@ impl TaskSettings {
         (self.close_outputs | self.open_outputs) >> 16 != 0
     }
 
-    /// The gripper by the controller's outputs. Where only one way is configured, everything else is the other way.
+    /// State of the gripper from the controller's outputs. If outputs are configured for one direction only, any other
+    /// value is the other direction.
     pub fn grip(&self, levels: u32) -> Grip {
-        let shows = |word: u32| (word >> 16 != 0).then_some((levels ^ word) & (word >> 16) == 0);
-        match (shows(self.close_outputs), shows(self.open_outputs)) {
+        let matches = |word: u32| (word >> 16 != 0).then_some((levels ^ word) & (word >> 16) == 0);
+        match (matches(self.close_outputs), matches(self.open_outputs)) {
             (None, None) => Grip::None,
             (Some(closed), None) => [Grip::Open, Grip::Closed][usize::from(closed)],
             (None, Some(open)) => [Grip::Closed, Grip::Open][usize::from(open)],
@@ -96,9 +96,8 @@ impl TaskSettings {
     }
 }
 
-/// Whether closing and opening cannot be told apart by the outputs: no output that both set is set differently. Such a
-/// gripper would be "opened" by what closes it, and nobody could read back what it holds. Words are mask and values, 16
-/// bits each.
+/// Whether the outputs of closing and opening cannot be distinguished: no output that both set is set differently.
+/// Opening would then not undo closing, and the state could not be read back. Mask and values, 16 bits each.
 pub const fn same_words(close: u32, open: u32) -> bool {
     let both = close >> 16 & open >> 16;
     close >> 16 != 0 && open >> 16 != 0 && (close ^ open) & both == 0
@@ -108,7 +107,7 @@ pub const fn same_words(close: u32, open: u32) -> bool {
 mod tests {
     use super::*;
 
-    /// Closing sets 0 and clears 9, opening the reverse: a valve with two coils.
+    /// Closing sets output 0 and clears 9, opening the reverse: a valve with two coils.
     const BOTH: TaskSettings = task(0x0201_0001, 0x0201_0200);
 
     const fn task(close_outputs: u32, open_outputs: u32) -> TaskSettings {
@@ -124,7 +123,7 @@ mod tests {
 
     #[test]
     fn outputs_are_read_back() {
-        // Other outputs than the gripper's say nothing.
+        // Other outputs do not matter.
         for other in [0, 0xfe] {
             assert_eq!(BOTH.grip(0x001 | other), Grip::Closed);
             assert_eq!(BOTH.grip(0x200 | other), Grip::Open);
@@ -139,29 +138,29 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_has_seen_may_hold_and_a_command_is_believed_until_it_can_show() {
+    fn unread_outputs_may_hold_and_a_command_counts_until_the_outputs_can_show_it() {
         let mut f = Fingers::new(&BOTH);
-        assert!(f.may_hold(), "nothing seen yet");
-        f.see(&BOTH, 0x200, 5);
+        assert!(f.may_hold(), "outputs not read yet");
+        f.observe(&BOTH, 0x200, 5);
         assert!(!f.may_hold());
-        f.tell(true, 10);
-        f.see(&BOTH, 0x200, 10 + SETTLE_NS - 1);
-        assert!(f.may_hold(), "the outputs are still on their way");
-        f.see(&BOTH, 0x200, 10 + SETTLE_NS);
-        assert!(!f.may_hold(), "they never changed: it is open");
+        f.command(true, 10);
+        f.observe(&BOTH, 0x200, 10 + SETTLE_NS - 1);
+        assert!(f.may_hold(), "the outputs may still be old");
+        f.observe(&BOTH, 0x200, 10 + SETTLE_NS);
+        assert!(!f.may_hold(), "they did not change: it is open");
         let mut f = Fingers::new(&task(0, 0));
         assert!(!f.may_hold());
-        f.tell(true, 0);
-        f.see(&task(0, 0), 0, u64::MAX);
+        f.command(true, 0);
+        f.observe(&task(0, 0), 0, u64::MAX);
         assert!(f.may_hold() && f.grip() == Grip::None);
     }
 
     #[test]
-    fn words_that_cannot_be_told_apart() {
+    fn outputs_that_cannot_be_distinguished() {
         assert!(same_words(0x0001_0001, 0x0001_0001), "the same");
-        assert!(same_words(0x0001_0001, 0x0002_0002), "each sets its own and none takes the other's back");
+        assert!(same_words(0x0001_0001, 0x0002_0002), "each sets its own output, and neither clears the other's");
         assert!(!same_words(0x0001_0001, 0x0001_0000));
         assert!(!same_words(0x0003_0001, 0x0003_0002));
-        assert!(!same_words(0x0001_0001, 0), "one way only");
+        assert!(!same_words(0x0001_0001, 0), "one direction only");
     }
 }

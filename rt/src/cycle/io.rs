@@ -1,4 +1,4 @@
-//! What goes into a cycle of the command cycle and what comes out of it.
+//! Input and output of one cycle of the command thread.
 
 use super::grip::Grip;
 use crate::arm::{ArmCommand, Joints, RobotState};
@@ -8,29 +8,29 @@ use crate::mode::{FaultCause, HoldCause, ModeName, Reject};
 use crate::online::Vision;
 use crate::setpoint::SetPoint;
 
-/// The link to the robot as its owner sees it this cycle.
+/// State of the link to the robot in this cycle, from the code that owns the link.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LinkStatus {
     /// Connected, recipes set up, control script started.
     pub connected: bool,
-    /// Token given to our script's instance; 0 leaves the echoed token unchecked.
+    /// Token of the control script's instance; 0 leaves the echoed token unchecked.
     pub token: i32,
-    /// Set-points in a row that could not be sent.
+    /// Consecutive set-points that could not be sent.
     pub blocked_sends: u32,
-    /// State packages of this session that came, and those that the controller left out by its own clock; both wrap.
+    /// State packages received in this session; wraps.
     pub states: u32,
-    /// See `states`.
+    /// State packages that the controller left out, by its own clock; wraps.
     pub states_missing: u32,
 }
 
-/// What an operator can ask for.
+/// An operator's request.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum RequestKind {
-    /// Allow motion to be asked for.
+    /// Allow `Servo`; moves nothing.
     Arm,
-    /// Take that back.
+    /// Withdraw `Arm`.
     Disarm,
-    /// Go to the set-point.
+    /// Start the motion to the set-point.
     Servo,
     /// Ramp down; never refused.
     Stop,
@@ -38,65 +38,66 @@ pub enum RequestKind {
     Reset,
     /// Close or open the gripper; only at rest or converged.
     Gripper {
-        /// Close, or open.
+        /// `true` to close, `false` to open.
         close: bool,
     },
-    /// Close the gripper and turn the valve about its axis by an angle (rad, right-handed about the normal towards the cameras).
+    /// Close the gripper and turn the valve about its axis by an angle (rad, right-handed about the normal towards the
+    /// cameras).
     Turn {
         /// The angle, rad.
         angle_rad: f64,
     },
-    /// Open the gripper and go back to the standoff.
+    /// Open the gripper and move back to the standoff.
     Retreat,
-    /// The operator's lease ran out: hold.
+    /// The operator's lease expired: hold.
     LeaseLost,
 }
 
-/// A request with the number that its answer carries.
+/// A request with the number that its reply carries.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Request {
-    /// Chosen by who asks.
+pub struct CommandRequest {
+    /// Chosen by the caller.
     pub id: u64,
-    /// What for.
+    /// The request.
     pub kind: RequestKind,
 }
 
-/// The answer to a request, in the same cycle.
+/// The reply to a request, in the same cycle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Reply {
     /// The request's number.
     pub id: u64,
-    /// Done, or why not.
+    /// Granted, or the reason why not.
     pub result: Result<(), Reject>,
 }
 
-/// Everything one cycle is told.
+/// Input of one cycle.
 #[derive(Clone, Copy, Debug)]
 pub struct CommandInput<'a> {
     /// Now, CLOCK_MONOTONIC ns.
     pub now_ns: u64,
-    /// The newest robot state that came since the last cycle, if one did.
+    /// The newest robot state received since the last cycle, if any.
     pub robot: Option<RobotState>,
     /// The link.
     pub link: LinkStatus,
-    /// The newest vision result since the last cycle, if there is one.
+    /// The newest vision result since the last cycle, if any.
     pub vision: Option<&'a Vision>,
-    /// At most one request; a stop goes before all others.
-    pub request: Option<Request>,
-    /// A set-point offered by the operator.
+    /// At most one request; the caller passes a stop before all others.
+    pub request: Option<CommandRequest>,
+    /// A set-point from the operator.
     pub setpoint: Option<&'a SetPoint>,
     /// A thread of the daemon ended or a defect was caught: stop.
     pub internal_fault: bool,
 }
 
-/// Which part of the way the gripper is on.
+/// Part of the task that the gripper is moving through.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Stage {
-    /// To the standoff pose.
+    /// To the standoff pose (pre-grasp).
     #[default]
     Pregrasp = 0,
-    /// From there to the grasp.
+    /// From the standoff to the grasp.
     Grasp = 1,
     /// Turning the valve.
     Turn = 2,
@@ -104,27 +105,27 @@ pub enum Stage {
     Retreat = 3,
 }
 
-/// Something that happened in this cycle and belongs in the log.
+/// A change of mode, for the log.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Transition {
     /// The mode before.
     pub from: ModeName,
     /// The mode after.
     pub to: ModeName,
-    /// Why.
+    /// The cause.
     pub why: Why,
 }
 
 /// Why a mode changed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Why {
-    /// Readiness came or went.
+    /// Marks and robot became ready, or are no longer.
     Readiness,
-    /// An operator asked.
+    /// An operator's request.
     Request(RequestKind),
-    /// The goal was reached, or left.
+    /// The goal was reached or left.
     Progress,
-    /// A stop came to rest.
+    /// The stop ramp has ended at rest.
     AtRest,
     /// A hold.
     Hold(HoldCause),
@@ -132,7 +133,7 @@ pub enum Why {
     Fault(FaultCause),
 }
 
-/// Counts since start.
+/// Counters since start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
     /// Cycles run.
@@ -141,7 +142,7 @@ pub struct Counters {
     pub overruns: u64,
     /// Vision results used.
     pub frames: u64,
-    /// Vision results refused (stamps, order, skew, jumps, not finite).
+    /// Vision results refused (time stamps, order, skew, jumps, values that are not finite).
     pub frames_refused: u64,
     /// Robot states used.
     pub states: u64,
@@ -149,22 +150,22 @@ pub struct Counters {
     pub held: u64,
 }
 
-/// What the loop knew and did in one cycle: for telemetry, recordings and the fault dump.
+/// State and figures of one cycle: for telemetry, recordings and the fault dump.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CycleRecord {
-    /// When, CLOCK_MONOTONIC ns.
+    /// Time of the cycle, CLOCK_MONOTONIC ns.
     pub now_ns: u64,
-    /// Real time since the last cycle, ns.
+    /// Time since the last cycle, ns.
     pub dt_ns: u64,
     /// Mode after the cycle.
     pub mode: ModeName,
-    /// While the arm is not driven: what is wrong with the robot; in a fault, what still would be after a reset.
+    /// While the arm is not driven: the fault of the robot; in mode fault, the fault that would remain after a reset.
     pub lasting: Option<FaultCause>,
-    /// Part of the way.
+    /// Part of the task.
     pub stage: Stage,
-    /// Whether the motion is still in its slow probe.
+    /// Whether the motion is in its slow probe.
     pub probing: bool,
-    /// Progress along the present leg, 0 to 1.
+    /// Progress along the current leg, 0 to 1.
     pub progress: f64,
     /// Sequence number of the image in use.
     pub vision_sequence: u64,
@@ -176,53 +177,55 @@ pub struct CycleRecord {
     pub q: Joints,
     /// Measured joint velocities, rad/s.
     pub qd: Joints,
-    /// Gripper in the rig now, predicted; `None` before the marks were seen.
+    /// Gripper pose in the rig now, predicted; `None` before the marks were seen.
     pub left_from_gripper: Option<Pose>,
-    /// The gripper by its outputs.
+    /// State of the gripper by its outputs.
     pub grip: Grip,
-    /// The reference, in the rig.
+    /// Reference pose of the gripper in the rig, `left_from_gripper`.
     pub reference: Pose,
-    /// Mark error against the reference, pixels rms; NaN while the law does not drive.
+    /// Distance of the marks from the reference, pixels rms per coordinate; NaN while the law does not drive.
     pub error_px: f64,
-    /// What no motion can remove of it, pixels: at rest the rig's health figure; NaN while the law does not drive.
+    /// Part of `error_px` that no motion can remove, pixels: noise and calibration error; NaN while the law does not
+    /// drive.
     pub residual_px: f64,
-    /// Motion that would bring the marks onto the reference, gripper frame.
+    /// Motion that would bring the marks onto the reference, gripper frame `[v; ω]` (m, rad).
     pub correction: Twist,
-    /// Velocity screw asked for, gripper frame.
+    /// Velocity screw that the law asks for, gripper frame `[v; ω]` (m/s, rad/s).
     pub screw: Twist,
     /// Joint rates before the guard, rad/s.
     pub wanted: Joints,
-    /// What is sent.
+    /// The command that is sent.
     pub command: ArmCommand,
-    /// What held it back.
+    /// Limits that held it back.
     pub held: Held,
-    /// Speed share in force (age of data, marks, singularity, guard), 0 to 1.
+    /// Fraction of the full speed in force (age of data, marks, singularity, guard), 0 to 1.
     pub scale: f64,
-    /// Smallest singular value of the mark stack, px/m; NaN while the law does not drive, as the next two.
+    /// Smallest singular value of the stacked interaction matrices, px/m; NaN while the law does not drive, as the next
+    /// two.
     pub mark_sigma: f64,
-    /// Condition number of the mark stack.
+    /// Condition number of the stacked interaction matrices.
     pub mark_condition: f64,
-    /// Smallest singular value of the arm, m/s per rad/s.
+    /// Smallest singular value of the arm's Jacobian (unit-scaled), m/s per rad/s.
     pub arm_sigma: f64,
-    /// Joint to bend away, 0 to 5.
+    /// Joint to move away from the nearest singularity, 0 to 5.
     pub arm_joint: u8,
-    /// Counts since start.
+    /// Counters since start.
     pub counters: Counters,
-    /// Identity of the set-point, 0 for none.
+    /// Identity of the set-point; 0 without one.
     pub setpoint_id: u64,
 }
 
-/// Everything one cycle says.
+/// Output of one cycle.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CommandOutput {
-    /// What goes to the arm.
+    /// For the arm.
     pub command: ArmCommand,
-    /// What goes to telemetry.
+    /// For telemetry and recordings.
     pub record: CycleRecord,
-    /// A change of mode with its cause.
+    /// The first change of mode in this cycle.
     pub event: Option<Transition>,
-    /// Answer to the request.
+    /// Reply to the request.
     pub reply: Option<Reply>,
-    /// Answer to the offered set-point.
+    /// Whether the set-point was accepted.
     pub setpoint_reply: Option<Result<(), Reject>>,
 }

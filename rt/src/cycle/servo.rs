@@ -1,4 +1,9 @@
-//! The moving part of the cycle: where the gripper is, where it should be, and the rates that lead there.
+//! The control law of one cycle: where the gripper is, where it should be, and the joint rates that lead there.
+//!
+//! The marks of the newest image are moved to now by the joints ([`crate::online::predict`]), compared with the
+//! reference's marks ([`crate::online::path`]), and stacked and solved for the gripper's screw
+//! ([`crate::online::screw`], with the interaction matrix of [`crate::online::interaction`]), which the arm's Jacobian
+//! turns into joint rates ([`crate::online::rates`]).
 
 use super::io::Stage;
 use super::settings::CycleConfig;
@@ -17,18 +22,18 @@ use nalgebra::{Matrix6, Vector6};
 
 type Offsets = [[Option<Pixel>; MAX_MARKS]; 2];
 
-/// A motion under way: the leg, and the plan's offsets at both its ends.
+/// A motion in progress: the leg, and the offsets of the plan's pixels at its two ends.
 #[derive(Clone, Debug)]
 pub(super) struct Motion {
     pub(super) stage: Stage,
     pub(super) reference: Reference,
     from: Offsets,
     to: Offsets,
-    /// Marks without an offset at the end are not used there, because the plan does not see them.
+    /// Whether marks that the plan does not see at the end of the leg fade out towards it.
     fade: bool,
 }
 
-/// What one cycle of the law found.
+/// Result of one cycle of the law.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Drive {
     pub(super) pose: Pose,
@@ -40,7 +45,7 @@ pub(super) struct Drive {
     pub(super) arm_joint: u8,
 }
 
-/// Offsets of the plan's pixels from the projection of the goal pose.
+/// Offsets of the plan's pixels from the projection of the goal pose, pixels.
 fn offsets(rig: &Rig, gripper: &Gripper, goal: &Goal) -> Offsets {
     let mut out = [[None; MAX_MARKS]; 2];
     for view in View::BOTH {
@@ -79,7 +84,7 @@ impl Motion {
         }
     }
 
-    /// An arc about the valve's axis from the present reference.
+    /// An arc about the valve's axis from the current reference.
     pub(super) fn turn(&self, c: &CycleConfig, setpoint: &SetPoint, angle: f64) -> Option<Self> {
         let leg = Leg::arc(&self.reference.pose(), &setpoint.object_centre, &setpoint.object_normal, angle)?;
         Some(Self {
@@ -91,7 +96,7 @@ impl Motion {
         })
     }
 
-    /// Straight back by the plan's own standoff, as the gripper now stands.
+    /// Straight back from the current reference by the plan's standoff, in the gripper's present orientation.
     pub(super) fn retreat(&self, c: &CycleConfig, setpoint: &SetPoint) -> Self {
         let grasp_from_pregrasp = setpoint.grasp.left_from_gripper.inverse() * setpoint.pregrasp.left_from_gripper;
         let here = self.reference.pose();
@@ -104,7 +109,7 @@ impl Motion {
         }
     }
 
-    /// The stack of marks now: observed, moved on by the joints, against the reference.
+    /// Stacks and solves the marks: observed at capture, moved to now by the joints, compared with the reference.
     fn stack(&self, c: &CycleConfig, seen: &Seen, pose: &Pose, best: View) -> Result<Screw, ScrewError> {
         let mount = &c.gripper.flange_from_gripper;
         let at_capture = &seen.vision.left_from_gripper;
@@ -117,11 +122,11 @@ impl Motion {
             }
             let v = view.index();
             let camera = c.rig.camera(view);
-            let place = c.rig.view_from_left(view);
+            let view_from_left = c.rig.view_from_left(view);
             let then = at_capture * c.dh.gripper_motion(&seen.q, &seen.q_view[v], mount);
-            let then = PlacedView::new(camera, &(place * then));
-            let now = PlacedView::new(camera, &(place * pose));
-            let reference = PlacedView::new(camera, &(place * reference_pose));
+            let then = PlacedView::new(camera, &(view_from_left * then));
+            let now = PlacedView::new(camera, &(view_from_left * pose));
+            let reference = PlacedView::new(camera, &(view_from_left * reference_pose));
             for (i, mark) in c.gripper.marks.iter().enumerate() {
                 let Some(o) = &seen.vision.marks[v][i] else { continue };
                 let projections =
@@ -140,9 +145,11 @@ impl Motion {
         stack.solve()
     }
 
-    /// One cycle: pose now, correction, screw, joint rates within the speed caps times `share`.
+    /// One cycle: pose now, correction, screw `ξ = λ · correction + feed-forward` and joint rates within the speed
+    /// caps.
     ///
-    /// `scale` slows everything (age of the image, marks lost), `slider` is what the controller lets through of our rates.
+    /// # Errors
+    /// The marks or the arm do not allow a finite, well-conditioned solution.
     pub(super) fn drive(
         &mut self,
         c: &CycleConfig,
@@ -186,22 +193,22 @@ impl Motion {
         Ok(Drive { pose, screw, xi, rates, scale, arm_sigma: found.sigma_min, arm_joint: found.joint })
     }
 
-    /// Distance left to the end of the leg (m, unit-scaled), from the gripper's pose.
+    /// Distance from the gripper's pose to the end of the leg, metres (unit-scaled).
     pub(super) fn left_m(&self, c: &CycleConfig, pose: &Pose) -> f64 {
         c.settings.law.size(&log_pose(&(pose.inverse() * self.reference.leg().pose(1.0))))
     }
 }
 
-/// How fast a cycle may go.
+/// Speed limits of a cycle.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pace {
     /// Time since the last cycle, seconds, at most one period.
     pub(super) dt_s: f64,
-    /// Slows everything, 0 to 1.
+    /// Fraction of the speed for the age of the image and for lost marks, 0 to 1.
     pub(super) scale: f64,
-    /// Share of the speed caps, 0 to 1.
+    /// Fraction of the speed caps in force (reduced mode, probe), 0 to 1.
     pub(super) share: f64,
-    /// What the controller's slider lets through, 0 to 1.
+    /// Fraction of the commanded rates that the controller's speed slider lets through, 0 to 1.
     pub(super) slider: f64,
     /// Speed cap of the gripper, m/s.
     pub(super) tcp_cap: f64,
@@ -209,7 +216,7 @@ pub(super) struct Pace {
     pub(super) velocity: Joints,
 }
 
-/// Gripper screw that joint rates make, gripper frame.
+/// Gripper screw of joint rates, gripper frame (m/s, rad/s).
 pub(super) fn screw_of(jacobian: &Matrix6<f64>, rates: &Joints) -> Twist {
     jacobian * Vector6::from_column_slice(rates)
 }

@@ -1,4 +1,4 @@
-//! Every knob of the command cycle, with its default and why.
+//! All settings of the command cycle, with their defaults and reasons.
 
 use crate::arm::{Dh, Model};
 use crate::geom::Rig;
@@ -8,24 +8,24 @@ use crate::online::path::PathSettings;
 use crate::online::rates::RateSettings;
 use crate::online::screw::LawSettings;
 
-/// When the gripper counts as being on a goal.
+/// Tolerances within which the gripper is on a goal.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ConvergeSettings {
-    /// Filtered correction left, metres. Default 0.0003.
+    /// Largest filtered correction, metres. Default 0.0003.
     pub position_m: f64,
-    /// Filtered correction left, rad. Default 0.002 (0.11 degrees).
+    /// Largest filtered correction, rad. Default 0.002 (0.11 degrees).
     pub angle_rad: f64,
-    /// How much coarser both may become where the marks' noise allows no better. Default 5.
+    /// Factor by which both tolerances may open where the noise of the marks requires it. Default 5.
     pub noise_factor: f64,
-    /// Greatest mark error, pixels rms: a guard against a plan of another rig. Default 12.
+    /// Largest mark error, pixels rms: protects against a plan of another rig. Default 12.
     pub error_px: f64,
-    /// Images in a row on the grasp. Default 12.
+    /// Consecutive images within the tolerance at the grasp. Default 12.
     pub frames: u32,
-    /// How much coarser the pre-grasp pose may be passed. Default 4.
+    /// Factor on the tolerance at the pre-grasp pose. Default 4.
     pub pregrasp_factor: f64,
-    /// Images in a row on the pre-grasp pose. Default 3.
+    /// Consecutive images within that tolerance at the pre-grasp pose. Default 3.
     pub pregrasp_frames: u32,
-    /// Times the tolerance at which a converged gripper counts as having left. Default 6.
+    /// Factor on the tolerance beyond which a converged gripper has left the goal. Default 6.
     pub leave_factor: f64,
 }
 
@@ -44,64 +44,69 @@ impl Default for ConvergeSettings {
     }
 }
 
-/// What is watched, and when it stops the arm. The figures are those of the fault catalogue.
+/// Limits of the supervision: what stops the arm, and after how long.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct WatchSettings {
-    /// Greatest age of robot state, ns. Default 20 ms.
+    /// Largest age of the robot state, ns. Default 20 ms.
     pub state_age_ns: u64,
-    /// Least share of the controller's states that must come, over one second to two. Default 0.8, as the fault
-    /// catalogue has it; below it every delay that the law is tuned for is another one.
+    /// Smallest fraction of the controller's states that must arrive, over the last whole second. Default 0.8; with
+    /// fewer, the delays are not those that the law is tuned for.
     pub state_share: f64,
-    /// Least age of an image at which the arm is stopped, ns; three frame periods if that is more. Default 100 ms.
+    /// Age of the newest image at which the arm is stopped, ns; three frame periods if that is more. Default 100 ms.
     pub frame_age_ns: u64,
-    /// Greatest difference of the two eyes' stamps, ns; a quarter of the frame period if that is less. Default 5 ms.
+    /// Largest difference between the capture stamps of left and right, ns; a quarter of the frame period if that is
+    /// less. Default 5 ms.
     pub skew_ns: u64,
-    /// Longest time the echoed heartbeat may stand still, ns. Default 50 ms.
+    /// Longest time without a change of the echoed heartbeat, ns. Default 50 ms.
     pub echo_ns: u64,
-    /// Longest time set-points may fail to be sent, ns. Default 20 ms.
+    /// Longest time in which set-points cannot be sent, ns. Default 20 ms.
     pub blocked_ns: u64,
-    /// Velocity error of a joint against its set-points, rad/s. Default 0.1.
+    /// Largest velocity error of a joint against its set-points, rad/s. Default 0.1.
     pub tracking_rad_per_s: f64,
-    /// How long that may last, ns. Default 100 ms.
+    /// Longest time above `tracking_rad_per_s`, ns. Default 100 ms.
     pub tracking_ns: u64,
-    /// Position error of a joint against its set-points, rad. Default 0.05.
+    /// Largest position error of a joint against its set-points, rad. Default 0.05.
     pub tracking_rad: f64,
-    /// Velocity of a joint that was told to rest, rad/s. Default 0.02.
+    /// Largest velocity of a joint that is commanded to rest, rad/s. Default 0.02.
     pub uncommanded_rad_per_s: f64,
-    /// How long that may last, ns. Default 30 ms.
+    /// Longest time above `uncommanded_rad_per_s`, ns. Default 30 ms.
     pub uncommanded_ns: u64,
-    /// Difference between the controller's speed of its tool point and ours that is always allowed, m/s. Default 0.01:
-    /// the encoders' noise in speed (0.003 rad/s) on a metre of arm, three times.
+    /// Allowed difference between the controller's speed of its tool point and the computed one, m/s. Default 0.01:
+    /// three times the encoders' speed noise (0.003 rad/s) at one metre of arm.
     pub tool_m_per_s: f64,
-    /// Share of the faster of the two that is allowed besides. Default 0.1: a session begins with a table that is 30 mm
-    /// off at most, which is 6 % of half a metre of arm; a limit of 0.25 m/s is never passed by more than 0.04 m/s
-    /// unnoticed.
+    /// Additional allowed difference as a fraction of the faster of the two. Default 0.1: a session begins with
+    /// kinematics that are off by 30 mm at most, 6 % of half a metre of arm; a limit of 0.25 m/s is then never exceeded
+    /// by more than 0.04 m/s without a fault.
     pub tool_share: f64,
-    /// How long that may last, ns. Default 60 ms.
+    /// Longest time above that difference, ns. Default 60 ms.
     pub tool_ns: u64,
-    /// How long after the last set-point a joint may still be moving, ns. Default 250 ms.
+    /// Time after the last set-point in which a joint may still move, ns. Default 250 ms.
     pub settle_ns: u64,
-    /// Disagreement of images and joints from one image to the next that is refused, metres (unit-scaled). Default 0.012.
+    /// Disagreement of images and joints between two images from which a result is refused, metres (unit-scaled).
+    /// Default 0.012.
     pub jump_m: f64,
-    /// Disagreement over six images that counts, metres (unit-scaled); or `mismatch_share` of the motion if that is more. Default 0.005.
+    /// Disagreement over six images that counts as a mismatch, metres (unit-scaled); `mismatch_share` of the motion if
+    /// that is more. Default 0.005.
     pub mismatch_m: f64,
     /// See `mismatch_m`. Default 0.4.
     pub mismatch_share: f64,
-    /// Images in a row with such a disagreement. Default 6.
+    /// Consecutive images with a mismatch that are a fault. Default 6.
     pub mismatch_frames: u32,
-    /// Missed cycles within a second that hold the arm; 0 only counts them (a host without real-time scheduling). Default 5.
+    /// Missed cycles within one to two seconds above which the arm is held; 0 only counts them (a host without
+    /// real-time scheduling). Default 5.
     pub overruns_per_s: u32,
     /// Longest time without a cycle, ns. Default 20 ms.
     pub stall_ns: u64,
-    /// How long data must have been good before a held motion may go on, ns. Default 200 ms.
+    /// Time for which images and robot state must have been good before `servo`, ns. Default 200 ms.
     pub good_ns: u64,
     /// Longest time without progress, ns. Default 2 s.
     pub progress_ns: u64,
-    /// Share of the speed caps during the probe at the start of each motion. Default 0.1.
+    /// Fraction of the speed caps during the probe at the start of each motion. Default 0.1.
     pub probe_share: f64,
-    /// Intended motion after which the probe judges, metres (unit-scaled). Default 0.003.
+    /// Commanded motion after which the probe decides, metres (unit-scaled). Default 0.003.
     pub probe_m: f64,
-    /// Share of the intended motion that must be seen in the images, and greatest share seen across it. Default 0.4.
+    /// Smallest fraction of the commanded motion that must be seen in the images, and largest fraction of it that may
+    /// be seen across its direction. Default 0.4.
     pub probe_agreement: f64,
     /// Motion at which a probe that has not passed is a fault, metres (unit-scaled). Default 0.012.
     pub probe_limit_m: f64,
@@ -143,15 +148,15 @@ impl Default for WatchSettings {
 }
 
 impl WatchSettings {
-    /// For a host without real-time scheduling: missed cycles are counted and hold nothing, and robot state, images and the
-    /// loop itself may be twice as late. The robot-side watchdog of 50 ms stays what it is.
+    /// For a host without real-time scheduling: missed cycles are only counted, and robot state, images and the loop
+    /// may be twice as late. The robot-side watchdog of 50 ms is unchanged.
     pub fn best_effort() -> Self {
         let d = Self::default();
         Self {
             overruns_per_s: 0,
             stall_ns: 2 * d.stall_ns,
             state_age_ns: 2 * d.state_age_ns,
-            // A simulated controller on the same busy host leaves some out as well.
+            // A simulated controller on the same host also leaves some states out.
             state_share: 0.5,
             frame_age_ns: 2 * d.frame_age_ns,
             ..d
@@ -159,20 +164,21 @@ impl WatchSettings {
     }
 }
 
-/// What happens at the valve.
+/// Gripper outputs, and the motions after convergence.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TaskSettings {
-    /// Output bits that close the gripper: mask in the upper 16 bits, values in the lower 16; 0 if there are none. Default 0.
+    /// Output bits that close the gripper: mask in the upper 16 bits, values in the lower 16; 0 for no output. Default
+    /// 0.
     pub close_outputs: u32,
-    /// Output bits that open it. Default 0.
+    /// Output bits that open it, likewise. Default 0.
     pub open_outputs: u32,
-    /// Time that closing or opening takes, ns. Default 800 ms.
+    /// Duration of closing or opening, ns. Default 800 ms.
     pub grip_ns: u64,
-    /// Close as soon as the gripper is on the grasp, without being asked. Default false.
+    /// Whether the gripper closes on the grasp without a request. Default false.
     pub close_on_arrival: bool,
-    /// Greatest angle of one turn, rad. Default 1.6 (a quarter turn and a little).
+    /// Largest angle of one turn, rad. Default 1.6, a little more than a quarter turn.
     pub max_turn_rad: f64,
-    /// Speed share of turning and of the retreat, 0 to 1. Default 0.5.
+    /// Fraction of the path's speed for turn and retreat, 0 to 1. Default 0.5.
     pub speed_share: f64,
 }
 
@@ -192,9 +198,9 @@ impl Default for TaskSettings {
 /// All settings of the cycle.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CycleSettings {
-    /// The cycle, ns. Default 2 ms.
+    /// Period of the command thread, ns. Default 2 ms.
     pub period_ns: u64,
-    /// Expected time between images, ns, until it has been measured. Default 16.7 ms.
+    /// Time between images, ns, until it has been measured. Default 16.7 ms.
     pub frame_period_ns: u64,
     /// The law.
     pub law: LawSettings,
@@ -228,17 +234,18 @@ impl Default for CycleSettings {
     }
 }
 
-/// What the cycle is built from. Where the rig stands relative to the robot is not among it.
+/// Everything that a cycle is built from. The pose of the rig relative to the robot is not part of it: the loop does
+/// not need it.
 #[derive(Clone, Debug)]
 pub struct CycleConfig {
     /// The arm's model: joint ranges and speeds.
     pub model: Model,
-    /// Its kinematics, nominal or the unit's own.
+    /// Its kinematics, nominal or calibrated.
     pub dh: Dh,
     /// The cameras.
     pub rig: Rig,
     /// Marks and mounting.
     pub gripper: Gripper,
-    /// Everything else.
+    /// All settings.
     pub settings: CycleSettings,
 }

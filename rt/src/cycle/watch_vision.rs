@@ -1,4 +1,4 @@
-//! Watches the images: what may be used, how old it is, and whether it agrees with the joints.
+//! Watches the vision results: which of them may be used, how old they are, and whether they agree with the joints.
 
 use super::settings::WatchSettings;
 use crate::arm::{Dh, Joints};
@@ -9,20 +9,31 @@ use crate::online::rig_watch::RigHealth;
 use crate::online::screw::{LawSettings, ViewMode};
 use crate::online::{Vision, VisionStatus};
 
-/// Images over which motion is compared.
+/// Images over which the motion of images and joints is compared.
 const WINDOW: usize = 6;
+/// How far a capture stamp may be in the future, ns.
+const MAX_AHEAD_NS: u64 = 2_000_000;
+/// Oldest capture that is used, ns.
+const MAX_AGE_NS: u64 = 1_000_000_000;
+/// Longest time between two images that counts for the frame period, ns.
+const MAX_PERIOD_NS: u64 = 500_000_000;
+/// Consecutive results with bad stamps, with skew or with jumps that stop the arm.
+const MAX_REFUSED: u32 = 3;
+/// Consecutive results without marks that hold the arm.
+const MAX_LOST: u32 = 2;
 
-/// Marks in a view below which it adds no depth, and results in a row after which that is no passing hand (80 ms at 60 Hz).
-const VIEW_MARKS: u8 = 3;
-const ONE_VIEW_RESULTS: u32 = 5;
+/// Smallest number of marks in a view with which it contributes depth.
+const MIN_VIEW_MARKS: u8 = 3;
+/// Consecutive results with fewer marks in one view that hold the arm: 80 ms at 60 Hz, longer than a passing hand.
+const MAX_ONE_VIEW_RESULTS: u32 = 5;
 
-/// A vision result in use, and where the joints were when its images were taken.
+/// A vision result in use, with the joint positions at its captures.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Seen {
     pub(super) vision: Vision,
-    /// Joints at the middle of the two captures.
+    /// Joint positions at the middle of the two captures, rad.
     pub(super) q: Joints,
-    /// Joints at each eye's capture.
+    /// Joint positions at the capture of each view, rad.
     pub(super) q_view: [Joints; 2],
 }
 
@@ -36,13 +47,13 @@ fn middle(c: &[u64; 2]) -> u64 {
     c[0] / 2 + c[1] / 2 + (c[0] & c[1] & 1)
 }
 
-/// The images as known now.
+/// What is known of the images.
 #[derive(Clone, Debug)]
 pub(super) struct VisionWatch {
     settings: WatchSettings,
     law: LawSettings,
     seen: Option<Seen>,
-    /// Pose and joints of the last images, newest at `at`.
+    /// Poses and joint positions of the last images, newest at `at`.
     track: [Option<(Pose, Joints)>; WINDOW],
     at: usize,
     period_ns: u64,
@@ -55,14 +66,14 @@ pub(super) struct VisionWatch {
     jump_m: f64,
     mismatches: u32,
     mismatch: (f64, f64),
-    /// Results in a row in which one view showed next to nothing.
+    /// Consecutive results in which one view showed too few marks.
     one_view: u32,
-    /// The rig as the newest result has it, refused ones included.
+    /// State of the rig by the newest result, refused ones included.
     rig: Option<RigHealth>,
     good_since_ns: Option<u64>,
 }
 
-/// What became of an offered vision result.
+/// Whether an offered vision result was used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Taken {
     Used,
@@ -93,7 +104,7 @@ impl VisionWatch {
         }
     }
 
-    /// Takes a vision result. While the arm is driven, one that jumps is refused; at rest it is a fresh start.
+    /// Takes a vision result. While the arm is driven, a result that jumps is refused; at rest it starts anew.
     pub(super) fn offer(
         &mut self,
         now_ns: u64,
@@ -116,7 +127,7 @@ impl VisionWatch {
         let (early, late) = (v.capture_ns[0].min(v.capture_ns[1]), v.capture_ns[0].max(v.capture_ns[1]));
         let last = self.seen.map_or(0, |s| s.capture_ns());
         let capture = middle(&v.capture_ns);
-        if late > now + 2_000_000 || now.saturating_sub(early) > 1_000_000_000 || (driven && capture <= last) {
+        if late > now + MAX_AHEAD_NS || now.saturating_sub(early) > MAX_AGE_NS || (driven && capture <= last) {
             self.bad_stamps += 1;
             return Taken::Refused;
         }
@@ -132,9 +143,9 @@ impl VisionWatch {
             self.lost += 1;
             return Taken::Refused;
         }
-        let places = [history.at(v.capture_ns[0]), history.at(v.capture_ns[1]), history.at(capture)];
-        let [Some(left), Some(right), Some(q)] = places else {
-            // No joints are known for that instant: nothing can be predicted from it.
+        let joints = [history.at(v.capture_ns[0]), history.at(v.capture_ns[1]), history.at(capture)];
+        let [Some(left), Some(right), Some(q)] = joints else {
+            // Without the joint positions at capture nothing can be predicted from it.
             self.lost += 1;
             return Taken::Refused;
         };
@@ -148,12 +159,12 @@ impl VisionWatch {
                 return Taken::Refused;
             }
             let step = capture - last;
-            if step < 500_000_000 {
+            if step < MAX_PERIOD_NS {
                 self.period_ns = (self.period_ns * 15 + step) / 16;
             }
         }
         self.jumps = 0;
-        let blind = self.law.views == ViewMode::Stereo && v.seen.iter().any(|s| *s < VIEW_MARKS);
+        let blind = self.law.views == ViewMode::Stereo && v.seen.iter().any(|s| *s < MIN_VIEW_MARKS);
         self.one_view = if blind { self.one_view.saturating_add(1) } else { 0 };
         let delay = now.saturating_sub(capture);
         self.delay_ns = if self.delay_ns == 0 { delay } else { (self.delay_ns * 15 + delay) / 16 };
@@ -162,7 +173,7 @@ impl VisionWatch {
         Taken::Used
     }
 
-    /// Compares the motion over the last images with the joints' own.
+    /// Compares the motion over the last images by images and by joints.
     fn compare_motion(&mut self, pose: &Pose, q: &Joints, dh: &Dh, mount: &Pose, driven: bool) {
         if !driven {
             self.track = [None; WINDOW];
@@ -187,17 +198,17 @@ impl VisionWatch {
         self.seen.as_ref()
     }
 
-    /// The rig as the marks show it; `None` before the first result.
+    /// State of the rig by the marks; `None` before the first result.
     pub(super) fn rig(&self) -> Option<&RigHealth> {
         self.rig.as_ref()
     }
 
-    /// Whether two views are to be used and only one shows the marks.
+    /// Whether both views are configured and only one shows the marks.
     pub(super) fn one_view(&self) -> bool {
-        self.one_view >= ONE_VIEW_RESULTS
+        self.one_view >= MAX_ONE_VIEW_RESULTS
     }
 
-    /// Age of the image in use, ns.
+    /// Age of the image in use, ns; `u64::MAX` without one.
     pub(super) fn age_ns(&self, now_ns: u64) -> u64 {
         self.seen.map_or(u64::MAX, |s| now_ns.saturating_sub(s.capture_ns()))
     }
@@ -207,10 +218,10 @@ impl VisionWatch {
         (3 * self.period_ns).max(self.settings.frame_age_ns)
     }
 
-    /// Speed share for the age of the image and the marks it shows: 1 while fresh, 0 at the limit.
+    /// Fraction of the speed for the age of the image and the marks in it: 1 while fresh, 0 at the limit.
     pub(super) fn scale(&self, now_ns: u64) -> f64 {
         let (age, limit) = (self.age_ns(now_ns), self.limit_ns());
-        // Fresh is: two periods more than the images usually take to arrive.
+        // Fresh: at most two periods older than images usually are on arrival.
         let hold = (self.delay_ns + 2 * self.period_ns).min(limit * 3 / 4);
         let by_age = if age <= hold {
             1.0
@@ -223,7 +234,7 @@ impl VisionWatch {
         if degraded || self.few_marks() { 0.5 * by_age } else { by_age }
     }
 
-    /// Whether the loss of one mark more would hold the arm (M01): one point of it in each view in use.
+    /// Whether the loss of one more mark, which is one point in each view in use, would hold the arm.
     fn few_marks(&self) -> bool {
         let Some(seen) = &self.seen else { return false };
         let [left, right] = seen.vision.marks.each_ref().map(|view| view.iter().flatten().count());
@@ -236,23 +247,23 @@ impl VisionWatch {
         points < usize::from(self.law.min_points) + spare
     }
 
-    /// Whether there is a fresh result to start from.
+    /// Whether the newest result is fresh and shows the marks.
     pub(super) fn tracking(&self, now_ns: u64) -> bool {
         self.age_ns(now_ns) < self.limit_ns() && self.lost == 0
     }
 
-    /// Since when every result has been usable.
+    /// For how long every result has been usable, ns.
     pub(super) fn good_for_ns(&self, now_ns: u64) -> Option<u64> {
         self.good_since_ns.filter(|_| self.tracking(now_ns)).map(|t| now_ns.saturating_sub(t))
     }
 
-    /// What latches.
+    /// The fault that latches now.
     pub(super) fn fault(&self, now_ns: u64) -> Option<FaultCause> {
         let (age_ns, limit_ns) = (self.age_ns(now_ns), self.limit_ns());
-        if self.bad_stamps >= 3 {
+        if self.bad_stamps >= MAX_REFUSED {
             return Some(FaultCause::FrameStamps { count: self.bad_stamps });
         }
-        if self.jumps >= 3 {
+        if self.jumps >= MAX_REFUSED {
             return Some(FaultCause::MarksJumped { jump_m: self.jump_m, limit_m: self.settings.jump_m });
         }
         if self.mismatches >= self.settings.mismatch_frames {
@@ -262,9 +273,9 @@ impl VisionWatch {
         (age_ns >= limit_ns).then_some(FaultCause::FramesStale { age_ns, limit_ns })
     }
 
-    /// What holds.
+    /// The cause that stops the motion now without latching.
     pub(super) fn hold(&self) -> Option<HoldCause> {
-        if self.lost >= 2 {
+        if self.lost >= MAX_LOST {
             return Some(HoldCause::MarksLost);
         }
         if self.rig.is_some_and(|r| r.suspicious) {
@@ -273,10 +284,10 @@ impl VisionWatch {
         if let Some(seen) = self.seen.filter(|_| self.one_view()) {
             return Some(HoldCause::OneView { seen: seen.vision.seen });
         }
-        (self.skewed >= 3).then_some(HoldCause::Skew { skew_ns: self.skew_ns })
+        (self.skewed >= MAX_REFUSED).then_some(HoldCause::Skew { skew_ns: self.skew_ns })
     }
 
-    /// Forgets events, and the track behind them.
+    /// Forgets past events and the track.
     pub(super) fn clear_events(&mut self) {
         self.bad_stamps = 0;
         self.skewed = 0;

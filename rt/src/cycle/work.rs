@@ -1,14 +1,14 @@
-//! What happens at the valve after convergence, with the loop closed all the while: close, turn, open, retreat.
+//! The task after convergence, with the loop closed throughout: close, turn, open, retreat.
 
 use super::io::RequestKind;
 use super::{CommandCycle, Motion};
 use crate::math;
 use crate::mode::{Mode, Reject};
 
-/// One step of the work.
+/// One step of the task.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Task {
-    /// Set outputs, then wait for the fingers.
+    /// Set the outputs, then wait for the gripper.
     Grip { close: bool },
     /// Turn about the valve's axis, rad.
     Turn(f64),
@@ -16,13 +16,13 @@ enum Task {
     Retreat,
 }
 
-/// Steps to come, and the one in progress.
+/// The steps to come and the one in progress.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Work {
     steps: heapless::Deque<Task, 4>,
-    /// The fingers are under way until then.
+    /// Until when the gripper is moving, ns.
     busy_until_ns: u64,
-    /// A leg of the work is being driven.
+    /// Whether a leg of the task is being driven.
     moving: bool,
 }
 
@@ -32,18 +32,18 @@ impl Work {
         self.moving = false;
     }
 
-    /// Whether nothing is to be done and no leg is under way.
+    /// Whether no step is queued and no leg is being driven.
     pub(super) fn idle(&self) -> bool {
         self.steps.is_empty() && !self.moving
     }
 }
 
 impl CommandCycle {
-    /// Closes or opens the gripper, where nothing moves or the loop holds.
+    /// Closes or opens the gripper; refused while the arm moves.
     pub(super) fn grip(&mut self, close: bool, now: u64) -> Result<(), Reject> {
-        let still =
+        let resting =
             matches!(self.mode, Mode::Armed | Mode::Tracking) || self.mode == Mode::Converged && self.work.idle();
-        if !still {
+        if !resting {
             return Err(Reject::WrongMode);
         }
         self.set_gripper(close, now);
@@ -53,16 +53,16 @@ impl CommandCycle {
     fn set_gripper(&mut self, close: bool, now: u64) {
         let t = self.config.settings.task;
         self.outputs = if close { t.close_outputs } else { t.open_outputs };
-        self.fingers.tell(close, now);
+        self.fingers.command(close, now);
         self.work.busy_until_ns = now.saturating_add(t.grip_ns);
     }
 
     fn may_turn(&self, angle: f64) -> Result<(), Reject> {
-        let most = self.config.settings.task.max_turn_rad;
-        if math::fabs(angle) <= most && angle != 0.0 { Ok(()) } else { Err(Reject::BadValue) }
+        let max = self.config.settings.task.max_turn_rad;
+        if math::fabs(angle) <= max && angle != 0.0 { Ok(()) } else { Err(Reject::BadValue) }
     }
 
-    /// Queues the steps of a request; refused unless the gripper is on the goal and nothing is under way.
+    /// Queues the steps of a request; refused unless the loop has converged and no step is in progress.
     pub(super) fn start_work(&mut self, kind: RequestKind, now: u64) -> Result<(), Reject> {
         if self.mode != Mode::Converged || !self.work.idle() {
             return Err(Reject::WrongMode);
@@ -82,14 +82,14 @@ impl CommandCycle {
         Ok(())
     }
 
-    /// Leads the work on while converged: the next step begins when the fingers are done and the leg before has ended.
+    /// Starts the next step when the gripper has finished moving and the last leg has converged.
     pub(super) fn continue_work(&mut self, now: u64) {
         if now < self.work.busy_until_ns {
             return;
         }
         if self.work.moving {
             let needed = self.config.settings.converge.frames;
-            let done = self.motion.as_ref().is_some_and(|m| m.reference.ended()) && self.steady >= needed;
+            let done = self.motion.as_ref().is_some_and(|m| m.reference.ended()) && self.convergence.steady() >= needed;
             if !done {
                 return;
             }
@@ -109,7 +109,7 @@ impl CommandCycle {
             Some(leg) => {
                 self.motion = Some(leg);
                 self.work.moving = true;
-                self.fresh_leg(now);
+                self.start_leg(now);
             }
             None => self.work.clear(),
         }

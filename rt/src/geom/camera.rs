@@ -3,7 +3,8 @@
 use super::{Normalized, Pixel, Vec3};
 use nalgebra::{Matrix2, Matrix2x3, Vector2};
 
-/// Distortion coefficients in OpenCV's order and meaning: radial k1, k2, tangential p1, p2, radial k3, denominator k4, k5, k6.
+/// Distortion coefficients in OpenCV's order and meaning: radial k1, k2, tangential p1, p2, radial k3, denominator k4,
+/// k5, k6.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 #[allow(missing_docs)]
 pub struct Distortion {
@@ -20,13 +21,13 @@ pub struct Distortion {
 /// Why camera parameters are refused.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum CameraError {
-    /// A parameter is not a finite number.
+    /// A parameter is not finite.
     NotFinite,
     /// A focal length is zero or negative.
     FocalLength,
-    /// The image has no pixels, or more than 65 535 on a side.
+    /// A side of the image is zero or above 65 535 pixels.
     ImageSize,
-    /// The distortion model folds the image over itself inside the image, so that a pixel has no unique ray.
+    /// The distortion is not invertible inside the image: a pixel has no unique ray.
     Folds,
 }
 
@@ -50,7 +51,10 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// Checks every parameter, and that the lens model is invertible over the whole image.
+    /// Checks every parameter, and that the distortion is invertible over the image (on a grid of 9 x 9 points).
+    ///
+    /// # Errors
+    /// The first failed check.
     pub fn validated(self) -> Result<Self, CameraError> {
         let d = &self.distortion;
         let all = [self.fx, self.fy, self.cx, self.cy, d.k1, d.k2, d.p1, d.p2, d.k3, d.k4, d.k5, d.k6];
@@ -75,7 +79,7 @@ impl Camera {
         Ok(self)
     }
 
-    /// Pixel of a normalized image point: distortion, then the pinhole.
+    /// Pixel of a normalized image point: lens distortion, then the pinhole model.
     #[inline]
     pub fn distort(&self, n: Normalized) -> Pixel {
         let (p, _) = self.distort_with_jacobian(n);
@@ -107,9 +111,9 @@ impl Camera {
         )
     }
 
-    /// Normalized point of a pixel with the distortion removed, by a bounded Newton iteration.
+    /// Normalized image point of a pixel, by a bounded Newton iteration.
     ///
-    /// `None` when the lens model cannot be inverted there (it folds), or the pixel is not finite.
+    /// `None` if the distortion is not invertible there, or the pixel is not finite.
     pub fn undistort(&self, p: Pixel) -> Option<Normalized> {
         if !(p.x.is_finite() && p.y.is_finite()) {
             return None;
@@ -123,7 +127,7 @@ impl Camera {
             let (q, j) = self.distort_with_jacobian(n);
             let e = p - q;
             let det = j.determinant();
-            // On the physical branch the map keeps its orientation; a sign change means that the model folded.
+            // The physical branch preserves orientation; a sign change means that the model is not invertible here.
             if !(det > 0.0) {
                 return None;
             }
@@ -146,7 +150,8 @@ impl Camera {
         Some(self.distort(Vector2::new(x.x / x.z, x.y / x.z)))
     }
 
-    /// Pixel of a point in this camera's frame, with the derivative by the point (pixels per metre, 2x3).
+    /// Pixel of a point in this camera's frame, with its derivative by the point (2x3, pixels per metre); `None` at or
+    /// behind the projection centre.
     pub fn project_with_jacobian(&self, x: &Vec3) -> Option<(Pixel, Matrix2x3<f64>)> {
         if !(x.z > 1e-9) {
             return None;
@@ -158,12 +163,12 @@ impl Camera {
         Some((p, jd * jn))
     }
 
-    /// Unit ray of a pixel in this camera's frame.
+    /// Unit ray of a pixel in this camera's frame; `None` as in [`Self::undistort`].
     pub fn ray(&self, p: Pixel) -> Option<Vec3> {
         self.undistort(p).map(|n| Vec3::new(n.x, n.y, 1.0).normalize())
     }
 
-    /// Whether a pixel lies inside the image by at least `margin` pixels.
+    /// Whether a pixel is inside the image by at least `margin` pixels.
     pub fn contains(&self, p: Pixel, margin: f64) -> bool {
         p.x >= margin
             && p.y >= margin
@@ -214,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn absurd_lenses_are_refused() {
+    fn impossible_cameras_are_refused() {
         let mut c = cam();
         c.distortion.k1 = -5.0;
         assert_eq!(c.validated(), Err(CameraError::Folds));

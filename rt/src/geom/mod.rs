@@ -1,8 +1,8 @@
-//! Frames, cameras and the rig: the vocabulary every stage shares.
+//! Frames, cameras and the stereo rig, used by every stage.
 //!
-//! Units are metres, radians, seconds and pixels. A pose `a_from_b` maps coordinates of frame b into frame a, so that in a
-//! product the inner names cancel: `left_from_gripper = left_from_object * object_from_gripper`. Camera axes are x right,
-//! y down, z forward; the centre of the top-left pixel is (0, 0). `left` is the rig's own frame.
+//! Units are metres, radians, seconds and pixels. A pose `a_from_b` maps coordinates of frame b into frame a, so that
+//! the inner names of a product cancel: `left_from_gripper = left_from_object * object_from_gripper`. Camera axes are x
+//! right, y down, z forward; the centre of the top-left pixel is (0, 0). `left` is the rig's own frame.
 
 mod camera;
 mod rig;

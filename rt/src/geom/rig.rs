@@ -1,4 +1,4 @@
-//! The stereo rig: two cameras and their relative pose. Where it stands relative to the robot is nowhere in graspd.
+//! The stereo rig: two cameras and their relative pose. graspd does not need the pose of the rig relative to the robot.
 
 use super::{Camera, Pixel, Pose, Vec3};
 
@@ -15,7 +15,7 @@ impl View {
     /// Both views, left first.
     pub const BOTH: [View; 2] = [View::Left, View::Right];
 
-    /// 0 for left, 1 for right: the index in every array that holds one entry a view.
+    /// 0 for left, 1 for right: the index in every array with one entry per view.
     pub const fn index(self) -> usize {
         match self {
             View::Left => 0,
@@ -31,7 +31,7 @@ pub struct Rig {
     pub left: Camera,
     /// The right camera.
     pub right: Camera,
-    /// Maps left-camera coordinates into right-camera coordinates.
+    /// Pose of the left camera in the frame of the right camera.
     pub right_from_left: Pose,
 }
 
@@ -44,7 +44,7 @@ impl Rig {
         }
     }
 
-    /// Pose that maps rig (left) coordinates into the view's camera.
+    /// Pose of the rig (left) frame in the frame of the view's camera.
     pub fn view_from_left(&self, view: View) -> Pose {
         match view {
             View::Left => Pose::identity(),
@@ -60,7 +60,7 @@ impl Rig {
         }
     }
 
-    /// Pixel of a point of the left frame in a view; `None` when it is behind that camera.
+    /// Pixel of a point of the left frame (metres) in a view; `None` if it is behind that camera.
     pub fn project(&self, view: View, x_left: &Vec3) -> Option<Pixel> {
         let x = self.view_from_left(view) * nalgebra::Point3::from(*x_left);
         self.camera(view).project(&x.coords)

@@ -1,11 +1,10 @@
-//! How wrong a calibrated rig may be, and what that does to the images: angles of view, from which every gate in
-//! pixels follows.
+//! The error of a calibrated rig and its effect on the images, from which the gates in pixels follow.
 //!
-//! Nine unknowns describe a rig that is off from what its file says: the right camera turned about its own centre
-//! (three), both focal lengths (common and half the difference), both principal points (four). A relative error of
-//! the baseline's length only scales what is seen; an error of its direction looks, at one distance, like a turn. The
-//! unknowns are taken as independent and normal, with the deviations of a [`RigError`]; everything is linear in them,
-//! since they are small.
+//! Nine unknowns describe how a rig differs from its file: rotation of the right camera about its centre (three), both
+//! focal lengths (common part and half the difference), both principal points (four). An error of the baseline's length
+//! only scales the scene; an error of its direction is, at one distance, equivalent to a rotation. The unknowns are
+//! independent and normal with the standard deviations of a [`RigError`]. They are small, so everything is linear in
+//! them.
 
 use super::{Pixel, Pose, Rig, Vec3, View, exp_twist};
 use crate::math;
@@ -14,17 +13,17 @@ use nalgebra::{Matrix2x3, SMatrix, SVector, Vector2, Vector6};
 /// Number of unknowns of a rig's error.
 pub const RIG_UNKNOWNS: usize = 9;
 
-/// The unknowns, in order: turn of the right camera about its own x, y, z (rad); focal lengths, common and half the
-/// difference right minus left (relative); principal points, left u, v and right u, v (pixels).
+/// The unknowns, in order: rotation of the right camera about its x, y, z (rad); focal lengths, common part and half
+/// the difference right minus left (relative); principal points, left u, v and right u, v (pixels).
 pub type RigOffset = SVector<f64, RIG_UNKNOWNS>;
 
 /// Derivative of a pixel by a [`RigOffset`].
 pub type RigJacobian = SMatrix<f64, 2, RIG_UNKNOWNS>;
 
-/// Standard deviations of a rig's own error.
+/// Standard deviations of the error of a rig.
 ///
-/// The default is what a careful calibration with a printed target leaves, and what is assumed of a rig whose file
-/// states nothing.
+/// The default is that of a careful calibration with a printed target. It is assumed for a rig whose file states no
+/// error.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RigError {
     /// Relative rotation of the cameras, about each axis, rad. Default 0.1 degrees.
@@ -49,7 +48,7 @@ impl Default for RigError {
 }
 
 impl RigError {
-    /// All deviations multiplied by `by`.
+    /// All standard deviations multiplied by `by`.
     pub fn scaled(&self, by: f64) -> Self {
         Self {
             rotation_rad: self.rotation_rad * by,
@@ -59,38 +58,38 @@ impl RigError {
         }
     }
 
-    /// The deviation of each unknown.
+    /// The standard deviation of each unknown.
     pub fn deviations(&self) -> RigOffset {
         let (r, p) = (self.rotation_rad, self.principal_px);
         RigOffset::from([r, r, r, self.focal, self.focal_difference, p, p, p, p])
     }
 
-    /// Length of an offset in deviations: the root of the sum of squares.
+    /// Length of an offset in standard deviations: the root of the sum of squares over the unknowns.
     pub fn sigmas(&self, offset: &RigOffset) -> f64 {
         math::sqrt(offset.component_div(&self.deviations().map(|d| d.max(1e-12))).norm_squared())
     }
 
-    /// Deviation of the distance of a mark's image from the epipolar line of its other image, pixels, for a point of
-    /// the left frame. `None` where it is behind a camera, or on the line through both.
+    /// Standard deviation of the distance of a point's right image from the epipolar line of its left image, pixels.
+    /// `x_left` is the point in the left frame, metres; `None` if it is behind a camera or on the line through both.
     pub fn epipolar_sigma_px(&self, rig: &Rig, x_left: &Vec3) -> Option<f64> {
         let (normal, left, right) = epipolar_normal(rig, x_left)?;
         let across = left.tr_mul(&normal[0]) + right.tr_mul(&normal[1]);
-        let right_share = math::sqrt(normal[1].norm_squared());
+        let right_part = math::sqrt(normal[1].norm_squared());
         let sigma = math::sqrt(across.component_mul(&self.deviations()).norm_squared());
-        (right_share > 1e-6).then(|| sigma / right_share)
+        (right_part > 1e-6).then(|| sigma / right_part)
     }
 }
 
-/// The direction of the four image coordinates of a point that no displacement of the point changes, with the
-/// derivative of each view's pixel by the unknowns.
+/// The direction in the four image coordinates of a point that no displacement of the point changes, and the
+/// derivatives of both pixels by the unknowns.
 fn epipolar_normal(rig: &Rig, x_left: &Vec3) -> Option<([Vector2<f64>; 2], RigJacobian, RigJacobian)> {
     let (_, gl) = rig.project_with_jacobian(View::Left, x_left)?;
     let (_, gr) = rig.project_with_jacobian(View::Right, x_left)?;
     let (_, jl) = rig.project_with_offset(View::Left, x_left)?;
     let (_, jr) = rig.project_with_offset(View::Right, x_left)?;
-    // The direction of the point's motion along the left ray leaves the left image alone: its right image moves along
-    // the epipolar line, and across that line is the right part of the normal. The left part balances the point's
-    // other motions.
+    // A motion of the point along the left ray does not change the left pixel and moves the right pixel along the
+    // epipolar line: the right part of the normal is across that line. The left part balances the other motions of the
+    // point.
     let along = gr * x_left;
     let across = Vector2::new(-along.y, along.x);
     let length = math::sqrt(across.norm_squared());
@@ -105,7 +104,7 @@ fn epipolar_normal(rig: &Rig, x_left: &Vec3) -> Option<([Vector2<f64>; 2], RigJa
 }
 
 impl Rig {
-    /// The rig with its parameters off by `offset`, exactly.
+    /// The rig with its parameters changed by `offset`, without linearization.
     pub fn offset(&self, offset: &RigOffset) -> Rig {
         let o = offset;
         let mut rig = *self;
@@ -121,15 +120,15 @@ impl Rig {
         rig
     }
 
-    /// Pixel of a point of the left frame in a view, with its derivative by the point.
+    /// Pixel of a point of the left frame in a view, and its derivative by the point (2x3, pixels per metre).
     pub fn project_with_jacobian(&self, view: View, x_left: &Vec3) -> Option<(Pixel, Matrix2x3<f64>)> {
-        let place: Pose = self.view_from_left(view);
-        let x = (place * nalgebra::Point3::from(*x_left)).coords;
+        let view_from_left: Pose = self.view_from_left(view);
+        let x = (view_from_left * nalgebra::Point3::from(*x_left)).coords;
         let (p, j) = self.camera(view).project_with_jacobian(&x)?;
-        Some((p, j * place.rotation.to_rotation_matrix().matrix()))
+        Some((p, j * view_from_left.rotation.to_rotation_matrix().matrix()))
     }
 
-    /// Pixel of a point of the left frame in a view, with its derivative by the rig's own error.
+    /// Pixel of a point of the left frame in a view, and its derivative by a [`RigOffset`].
     pub fn project_with_offset(&self, view: View, x_left: &Vec3) -> Option<(Pixel, RigJacobian)> {
         let x = (self.view_from_left(view) * nalgebra::Point3::from(*x_left)).coords;
         let camera = self.camera(view);
@@ -170,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn derivatives_agree_with_a_rig_that_is_off() {
+    fn derivatives_agree_with_finite_differences() {
         let rig = rig();
         let h = [1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-3, 1e-3, 1e-3, 1e-3];
         for x in points() {
@@ -188,10 +187,10 @@ mod tests {
         }
     }
 
-    /// The predicted deviation is the one that rigs drawn from the prior have: distance of the right image from the
+    /// The predicted standard deviation is that of rigs drawn from the prior: distance of the right pixel from the
     /// epipolar line.
     #[test]
-    fn the_epipolar_deviation_is_that_of_drawn_rigs() {
+    fn the_epipolar_deviation_agrees_with_drawn_rigs() {
         let (rig, error) = (rig(), RigError::default());
         let mut state = 7_u64;
         let mut normal = || {
@@ -207,7 +206,8 @@ mod tests {
                 let o = error.deviations().map(|d| d * normal());
                 let truth = rig.offset(&o);
                 let (l, r) = (truth.project(View::Left, &x).unwrap(), truth.project(View::Right, &x).unwrap());
-                // In the believed rig: the left pixel's ray, seen from the right as a line through two of its points.
+                // With the nominal rig: the left pixel's ray, projected to the right as a line through two of its
+                // points.
                 let ray = rig.left.undistort(l).unwrap();
                 let at = |z: f64| rig.project(View::Right, &Vec3::new(ray.x * z, ray.y * z, z)).unwrap();
                 let (a, b) = (at(x.z * 0.99), at(x.z * 1.01));

@@ -4,16 +4,16 @@ use super::{Pose, Vec3};
 use crate::math;
 use nalgebra::{Matrix3, Matrix6, Translation3, UnitQuaternion, Vector6};
 
-/// A velocity screw `[v; ω]`, m/s then rad/s; a name says in which frame and at which point it is expressed.
+/// A velocity screw `[v; ω]`, m/s then rad/s. The documentation of each use states its frame and point of reference.
 pub type Twist = Vector6<f64>;
 
 fn skew(v: &Vec3) -> Matrix3<f64> {
     Matrix3::new(0.0, -v.z, v.y, v.z, 0.0, -v.x, -v.y, v.x, 0.0)
 }
 
-/// The 6x6 matrix that turns a screw of body b expressed in b into the same motion expressed in a, for the pose `a_from_b`.
+/// The 6x6 adjoint of the pose `a_from_b`: maps a screw expressed in b to the same motion expressed in a.
 ///
-/// Both describe one rigid body; the screw in a is that of the point which coincides with a's origin.
+/// Both screws describe one rigid body; the velocity in a is that of the body's point at the origin of a.
 pub fn adjoint(a_from_b: &Pose) -> Matrix6<f64> {
     let r = a_from_b.rotation.to_rotation_matrix();
     let r = r.matrix();
@@ -43,14 +43,14 @@ pub fn exp_twist(xi: &Twist) -> Pose {
     };
     let wv = w.cross(&v);
     let t = v + wv * a + w.cross(&wv) * b;
-    // Quaternion by our own sin and cos, so that the bits do not depend on which libm nalgebra was built with.
+    // With `math::sin` and `math::cos`, so that the bits do not depend on the libm that nalgebra was built with.
     let half = 0.5 * th;
     let s = if th < 1e-6 { 0.5 - th2 / 48.0 } else { math::sin(half) / th };
     let q = nalgebra::Quaternion::new(math::cos(half), w.x * s, w.y * s, w.z * s);
     Pose::from_parts(Translation3::from(t), UnitQuaternion::new_normalize(q))
 }
 
-/// The body screw that [`exp_twist`] turns into this pose (the logarithm of SE(3)); the rotation part is at most pi long.
+/// The body screw for which [`exp_twist`] gives this pose (the logarithm of SE(3)); its rotation is at most pi.
 pub fn log_pose(p: &Pose) -> Twist {
     let q = p.rotation.quaternion();
     let (mut w, mut u) = (q.w, Vec3::new(q.i, q.j, q.k));
@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn adjoint_moves_points_alike() {
+    fn adjoint_gives_points_the_same_velocity() {
         let a_from_b = exp_twist(&Twist::new(0.2, -0.4, 1.0, 0.4, 0.9, -0.3));
         let xi_b = Twist::new(0.1, 0.2, -0.3, 0.5, -0.2, 0.7);
         let xi_a = transform_twist(&a_from_b, &xi_b);

@@ -1,8 +1,8 @@
-//! What no command may exceed, checked once at start against what is compiled in.
+//! Limits of every command, checked once at start against compiled ceilings.
 
 use crate::arm::{JointRange, Model};
 
-/// Absolute ceilings, compiled in: no configuration raises them.
+/// Absolute ceilings. No configuration raises them.
 pub mod ceiling {
     /// Joint speed, rad/s.
     pub const VELOCITY: f64 = 1.6;
@@ -12,52 +12,52 @@ pub mod ceiling {
     pub const TCP_SPEED: f64 = 0.5;
 }
 
-/// The longest and widest stop that a configuration may make of its limits, from full speed.
+/// Longest stop from full speed, in time and distance, that the limits of a configuration may give.
 pub mod stop_bound {
-    /// Time until the rates sent are zero, seconds: twice what the default limits need, which leaves a signal's whole
-    /// second for it.
+    /// Time until the rates sent are zero, seconds: twice what the default limits need, and well within the second that
+    /// a signal allows.
     pub const TIME_S: f64 = 0.3;
-    /// Way of the fastest joint, rad (8.6 degrees): five times what the default limits need.
+    /// Travel of the fastest joint, rad (8.6 degrees): five times that of the default limits.
     pub const JOINT_RAD: f64 = 0.15;
-    /// Way of the gripper's origin, m: three times what the default limits need, and less than the shortest default
-    /// standoff (80 mm), so that a stop begun at the pre-grasp ends before the part.
+    /// Travel of the gripper's origin, m: three times that of the default limits, and less than the shortest default
+    /// standoff (80 mm), so that a stop that begins at the pre-grasp ends before the part.
     pub const TCP_M: f64 = 0.05;
 }
 
-/// How a stop from full speed goes on the wire, from the first set-point of its ramp.
+/// Duration and travel of a stop from full speed, from the first set-point of its ramp.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StopFigures {
     /// Until the rates sent are zero, seconds.
     pub time_s: f64,
-    /// Way of the fastest joint, rad.
+    /// Travel of the fastest joint, rad.
     pub joint_rad: f64,
-    /// Way of the gripper's origin, m: both caps reached at once, the longest that its cap allows.
+    /// Travel of the gripper's origin, m, with both caps reached at the same time: the longest possible.
     pub tcp_m: f64,
 }
 
-/// The longest jerk filter, cycles: bounds its memory, and how late it may make a stop.
+/// Longest jerk filter, cycles: bounds its memory and the delay that it adds to a stop.
 pub const MAX_FILTER: usize = 32;
 
-/// Limits of the motion. All are kept by slowing the whole motion, so that its direction stays.
+/// Limits of the motion. All are kept by slowing all joints together, so that the direction of the motion is preserved.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LimitSettings {
     /// Joint speed, rad/s. Default 0.5.
     pub velocity_rad_per_s: f64,
     /// Joint acceleration, and the deceleration of every stop, rad/s². Default 4.
     pub acceleration_rad_per_s2: f64,
-    /// Joint jerk, rad/s³; 0 leaves acceleration free to step. Default 800.
+    /// Joint jerk, rad/s³; 0 allows steps of the acceleration. Default 800.
     pub jerk_rad_per_s3: f64,
     /// Speed of the gripper's origin, m/s. Default 0.25.
     pub tcp_speed_m_per_s: f64,
-    /// Share of the speeds that is allowed while the controller is in reduced mode. Default 0.4.
+    /// Fraction of the speed caps while the controller is in reduced mode. Default 0.4.
     pub reduced_share: f64,
-    /// Distance kept from each end of a joint's range, rad. Default 0.1.
+    /// Margin at each end of a joint's range, rad. Default 0.1.
     pub position_margin_rad: f64,
-    /// How long the arm may run on at the old speed after a command changes, seconds. Default 0.03.
+    /// Time for which the arm may continue at the old speed after a command changes, seconds. Default 0.03.
     pub reaction_s: f64,
-    /// Lowest joint positions, rad; narrows the model's own range.
+    /// Lowest joint positions, rad; narrows the range of the model.
     pub position_min_rad: [f64; 6],
-    /// Highest joint positions, rad; narrows the model's own range.
+    /// Highest joint positions, rad; narrows the range of the model.
     pub position_max_rad: [f64; 6],
 }
 
@@ -77,12 +77,12 @@ impl Default for LimitSettings {
     }
 }
 
-/// Why limits are refused: the key, its value, and what it may be at most (or at least).
+/// Why limits are refused: the key, its value, and the allowed range.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LimitError {
     /// The setting's name.
     pub key: &'static str,
-    /// What was asked for.
+    /// The configured value.
     pub value: f64,
     /// Lowest allowed value.
     pub lowest: f64,
@@ -90,7 +90,7 @@ pub struct LimitError {
     pub highest: f64,
 }
 
-/// Limits that have been checked; the guard takes no others.
+/// Checked limits; the guard takes no others.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {
     pub(crate) velocity: [f64; 6],
@@ -159,13 +159,13 @@ impl Limits {
         Ok(limits)
     }
 
-    /// The guard's own stop from full speed, to the cycle: the rates shrink by A T a cycle, N cycles long, and the mean
-    /// over the last n cycles, which begins full of the old rates, follows it by (n - 1) / 2 cycles and ends n - 1 cycles
+    /// The guard's stop from full speed, exact to the cycle: the rates shrink by A T per cycle for N cycles. The mean
+    /// over the last n cycles starts filled with the old rates, follows (n - 1) / 2 cycles later and ends n - 1 cycles
     /// later.
     pub fn stop_figures(&self) -> StopFigures {
         let fastest = self.velocity.iter().fold(0.0_f64, |m, v| m.max(*v));
         let (step, lag) = (self.acceleration * self.period_s, self.filter as f64 - 1.0);
-        // Cycles of the ramp, the last of which is rest.
+        // Cycles of the ramp; the last one is rest.
         let n = crate::math::ceil(fastest / step - 1e-9).max(1.0);
         let ramp = (n - 1.0) * fastest - step * (n - 1.0) * n * 0.5;
         let joint_rad = self.period_s * (ramp + fastest * lag * 0.5);
@@ -182,22 +182,22 @@ impl Limits {
         self.acceleration
     }
 
-    /// Cap of the gripper's speed, m/s.
+    /// Speed cap of the gripper, m/s.
     pub fn tcp_speed(&self) -> f64 {
         self.tcp_speed
     }
 
-    /// Lowest and highest joint positions that a motion may end at, rad (margin taken off).
+    /// Lowest and highest joint positions at which a motion may end, rad (without the margin).
     pub fn positions(&self) -> ([f64; 6], [f64; 6]) {
         (self.min, self.max)
     }
 
-    /// Longest time a stop takes on the wire, nanoseconds, with a cycle to spare for one that comes late.
+    /// Longest duration of a stop on the wire, nanoseconds, including one late cycle.
     pub fn ramp_ns(&self) -> u64 {
         ((self.stop_figures().time_s + self.period_s) * 1e9) as u64
     }
 
-    /// How long the arm may run on at the old speed after a command changes, seconds.
+    /// Time for which the arm may continue at the old speed after a command changes, seconds.
     pub fn reaction_s(&self) -> f64 {
         self.reaction_s
     }
@@ -212,7 +212,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn defaults_hold_for_every_model_and_cycle() {
+    fn defaults_are_valid_for_every_model_and_period() {
         for model in Model::ALL {
             for period in [1_000_000, 2_000_000, 8_000_000, 20_000_000] {
                 let l = Limits::new(&LimitSettings::default(), model, period).unwrap();
@@ -237,9 +237,9 @@ mod tests {
         assert_eq!(Limits::new(&d, Model::Ur5e, 1).unwrap_err().key, "period_s");
     }
 
-    /// What the formula says is what the guard does, from full speed of one joint and of all, at every cycle.
+    /// The formula agrees with the guard, from full speed of one joint and of all, at every period.
     #[test]
-    fn the_stop_is_the_guards_own_to_the_cycle() {
+    fn stop_figures_agree_with_the_guard_to_the_cycle() {
         use crate::guard::Guard;
         let d = LimitSettings::default();
         let jerk = |jerk_rad_per_s3| LimitSettings { jerk_rad_per_s3, ..d };
@@ -252,7 +252,7 @@ mod tests {
                 let (mut guard, dt) = (Guard::new(limits), limits.period_s);
                 let fastest = limits.velocity[0];
                 let wanted = [fastest, -fastest, 0.5 * fastest, 0.0, 0.0, fastest];
-                // No gripper speed at all, so that its cap does not slow the joints.
+                // A zero Jacobian: the gripper's speed cap does not slow the joints.
                 let still = nalgebra::Matrix6::zeros();
                 for _ in 0..2000 {
                     guard.step(&wanted, &[0.0; 6], &still, 1.0, dt);
@@ -273,7 +273,7 @@ mod tests {
 
     /// Both sides of each bound.
     #[test]
-    fn a_stop_that_takes_too_long_or_goes_too_far_is_refused() {
+    fn limits_with_a_long_or_wide_stop_are_refused() {
         let d = LimitSettings::default();
         let made = |s: LimitSettings| Limits::new(&s, Model::Ur5e, 2_000_000);
         let refused = |s: LimitSettings| made(s).unwrap_err().key;

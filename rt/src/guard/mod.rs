@@ -1,15 +1,15 @@
-//! The only way out: every rate that reaches the wire has passed through [`Guard::step`].
+//! The last stage before the wire: every joint rate that is sent comes out of [`Guard::step`] or [`Guard::stop`].
 //!
-//! It trusts nothing that computed the rates. Whatever comes in, numbers that are none included, what goes out is
-//! finite, within joint speed, joint acceleration and gripper speed, and leaves the arm able to stop before every
-//! joint's end. Limits are kept by slowing the whole motion, never by clipping single joints, so that its direction
-//! stays.
+//! The guard does not trust the code that computed the rates. Whatever comes in, including NaN and infinite values,
+//! what goes out is finite and within the limits of joint speed, joint acceleration and gripper speed, and the arm can
+//! always stop before the end of every joint's range. Limits are kept by slowing all joints together, never by clipping
+//! single joints, so that the direction of the motion is preserved.
 //!
-//! How it knows that it can always stop: the *stop ramp* shrinks all rates together to zero at the acceleration
-//! limit. A step towards the wanted rates is taken only if the stop ramp from there still ends inside the joints'
-//! ranges; otherwise the step taken is the stop ramp's own. A ramp that was possible at the last step is possible
-//! now, so by induction there is always one. A short mean over the last steps bounds the jerk; a mean of vectors
-//! within a (convex) limit is within it.
+//! Why the arm can always stop: the *stop ramp* scales all rates together to zero at the acceleration limit. A step
+//! towards the requested rates is taken only if the stop ramp from there ends inside the joints' ranges; otherwise the
+//! step is that of the stop ramp. A ramp that was possible at the last step is possible now, so by induction there is
+//! always one. A mean over the last steps bounds the jerk; the mean of vectors within a convex limit is within that
+//! limit.
 
 mod limits;
 
@@ -19,24 +19,24 @@ use crate::arm::Joints;
 use crate::math;
 use nalgebra::{Matrix6, Vector6};
 
-/// What held a motion back in one step, as bits.
+/// Limits that held a motion back in one step, as bits.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Held(pub u16);
 
 impl Held {
-    /// The wanted rates were above a joint's speed cap.
+    /// The requested rates were above a joint's speed cap.
     pub const VELOCITY: Held = Held(1);
-    /// The wanted rates were above the gripper's speed cap.
+    /// The requested rates were above the gripper's speed cap.
     pub const TCP: Held = Held(2);
     /// A joint is close to the end of its range.
     pub const POSITION: Held = Held(4);
     /// The change of rates was above the acceleration limit.
     pub const ACCELERATION: Held = Held(8);
-    /// The wanted rates were not finite numbers; the step was a stop ramp's.
+    /// The requested rates were not finite; the step was one of the stop ramp.
     pub const NOT_FINITE: Held = Held(16);
-    /// The step was a stop ramp's, because no step towards the wanted rates was safe.
+    /// No step towards the requested rates was safe; the step was one of the stop ramp.
     pub const FALLBACK: Held = Held(32);
-    /// The wanted rates were above a compiled ceiling.
+    /// The requested rates were above a compiled ceiling.
     pub const CEILING: Held = Held(64);
 
     /// Whether all bits of `other` are set.
@@ -49,34 +49,35 @@ impl Held {
     }
 }
 
-/// Rates to send, and what held them back.
+/// Rates to send, and the limits that held them back.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Guarded {
     /// Joint rates for the wire, rad/s.
     pub rates: Joints,
-    /// What held the motion back.
+    /// Limits that held the motion back.
     pub held: Held,
-    /// Share of the wanted speed that was possible, 0 to 1.
+    /// Fraction of the requested speed that was possible, 0 to 1.
     pub scale: f64,
 }
 
-/// The last stage before the wire. See the module's text for what it guarantees.
+/// The last stage before the wire; the module documentation states what it guarantees.
 #[derive(Clone, Debug)]
 pub struct Guard {
     limits: Limits,
     /// Rates within all limits, before the mean.
     raw: Joints,
-    /// What was sent last.
+    /// The rates sent last.
     out: Joints,
     ring: [Joints; MAX_FILTER],
     at: usize,
     stopping: bool,
 }
 
-/// Share of the gripper's speed cap that is aimed at: what the arm's turning adds within one filter length is kept
-/// for it.
+/// Fraction of the gripper's speed cap that a step aims at. The rest is for the change of the Jacobian within one
+/// length of the filter.
 const TCP_AIM: f64 = 0.95;
-/// Share of the way to a joint's end at which a motion is slowed, before the fallback has to.
+/// Fraction of the room to a joint's end within which a motion must be able to stop, so that it slows down before the
+/// stop ramp has to take over.
 const POSITION_AIM: f64 = 0.8;
 
 impl Guard {
@@ -90,21 +91,21 @@ impl Guard {
         &self.limits
     }
 
-    /// What was sent last, rad/s.
+    /// The rates sent last, rad/s.
     pub fn last(&self) -> &Joints {
         &self.out
     }
 
-    /// Whether what was sent last was rest.
+    /// Whether the rates sent last are zero.
     pub fn at_rest(&self) -> bool {
         self.out == [0.0; 6]
     }
 
-    /// One step towards `wanted` (rad/s).
+    /// One step towards the rates `wanted` (rad/s).
     ///
-    /// `q` are measured joint positions, `jacobian` the body Jacobian at the gripper there, `share` (0 to 1) lowers
-    /// the speed caps (reduced mode, probe), `dt_s` is the real time since the last step; more than one period counts
-    /// as one.
+    /// `q` are the measured joint positions (rad) and `jacobian` the gripper's body Jacobian there. `share` (0 to 1)
+    /// lowers the speed caps (reduced mode, probe). `dt_s` is the time since the last step, seconds; more than one
+    /// period counts as one.
     pub fn step(&mut self, wanted: &Joints, q: &Joints, jacobian: &Matrix6<f64>, share: f64, dt_s: f64) -> Guarded {
         self.stopping = false;
         let dt = self.usable(dt_s);
@@ -138,11 +139,11 @@ impl Guard {
         Guarded { rates: self.emit(dt), held, scale }
     }
 
-    /// One step of the stop ramp from what was sent last: all rates shrink together at the acceleration limit, their
-    /// norm never grows, and rest is reached within [`Limits::ramp_ns`] and stays.
+    /// One step of the stop ramp from the rates sent last: all rates shrink together at the acceleration limit, and
+    /// rest is reached within [`Limits::ramp_ns`].
     ///
-    /// The first step of a stop is taken from the rates on the wire, not from inside the jerk filter, so that an arm
-    /// that was speeding up slows down at once; in that one step the jerk limit gives way to the stop.
+    /// The first step starts from the rates on the wire, not from the input of the jerk filter, so that an accelerating
+    /// arm slows down immediately. That one step may exceed the jerk limit.
     pub fn stop(&mut self, dt_s: f64) -> Guarded {
         let dt = self.usable(dt_s);
         if !self.stopping {
@@ -158,7 +159,8 @@ impl Guard {
         if dt_s.is_finite() { dt_s.clamp(0.0, self.limits.period_s) } else { 0.0 }
     }
 
-    /// Greatest share of `wanted` (at most 1) that keeps speed caps and slows before the joints' ends.
+    /// Largest fraction of `wanted` (at most 1) within the speed caps from which the arm can stop before the joints'
+    /// ends.
     fn possible(&self, wanted: &Joints, q: &Joints, jacobian: &Matrix6<f64>, share: f64, held: &mut Held) -> f64 {
         let l = &self.limits;
         let mut scale = 1.0_f64;
@@ -189,7 +191,7 @@ impl Guard {
             if !room.is_finite() {
                 continue;
             }
-            // With s the share, the ramp travels s² v f / 2A + s v dead; it has to be at most the room.
+            // With the fraction s, the ramp travels s² v f / 2A + s v dead (f: fastest joint), at most the room.
             let speed = math::fabs(v);
             let a = speed * fastest / (2.0 * l.acceleration);
             let b = speed * self.dead_s();
@@ -202,7 +204,8 @@ impl Guard {
         if scale.is_finite() { scale.clamp(0.0, 1.0) } else { 0.0 }
     }
 
-    /// Time at full speed before a stop takes hold: the arm's own reaction, a cycle each way, the filter's delay.
+    /// Time at full speed before a stop takes effect, seconds: the arm's reaction, a cycle each way, the delay of the
+    /// filter.
     fn dead_s(&self) -> f64 {
         self.limits.reaction_s + self.limits.period_s * (2.0 + 0.5 * self.limits.filter as f64)
     }
@@ -223,7 +226,7 @@ impl Guard {
         math::sqrt(xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2])
     }
 
-    /// Takes the mean with the last steps, bounds the change by what `dt` allows, and notes what goes out.
+    /// Filters: the mean over the last steps, its change bounded by the acceleration limit times `dt`.
     fn emit(&mut self, dt: f64) -> Joints {
         let n = self.limits.filter.clamp(1, MAX_FILTER);
         self.at = (self.at + 1) % n;
@@ -245,11 +248,11 @@ impl Guard {
     }
 }
 
-/// `rates` with the largest brought `step` closer to zero and all others shrunk alike; rest when that crosses zero.
+/// `rates` scaled so that the fastest is `step` closer to zero; zero when that would cross it.
 fn ramp(rates: &Joints, step: f64) -> Joints {
     let fastest = rates.iter().fold(0.0_f64, |m, v| m.max(math::fabs(*v)));
     if !(fastest > step) {
-        // With no time passed nothing moves, not even to zero.
+        // No time has passed: the rates stay.
         return if step > 0.0 { [0.0; 6] } else { *rates };
     }
     let k = 1.0 - step / fastest;

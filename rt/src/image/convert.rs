@@ -1,12 +1,12 @@
-//! Camera formats into the mono8 image that tracking reads.
+//! Conversion of camera formats to the mono8 image that tracking reads.
 //!
-//! Each function writes a caller's buffer of `width * height` bytes without padding, so that its result is read with
-//! `ImageView::new(out, width, height, width)`. The work is one pass over the image; nothing is allocated.
+//! Each function writes `width * height` bytes without padding to the caller's buffer; read the result with
+//! `ImageView::new(out, width, height, width)`. One pass over the image, no allocation.
 
 /// Why an image cannot be converted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ConvertError {
-    /// The source has fewer bytes than width, height and stride say.
+    /// The source has fewer bytes than width, height and stride require.
     SourceTooShort,
     /// The target has fewer than `width * height` bytes.
     TargetTooShort,
@@ -39,9 +39,13 @@ fn check(
     Ok(())
 }
 
-/// Little-endian 16-bit words of which the lowest `bits` count (12 for mono12 unpacked, 16 for mono16) to mono8, rounded down.
+/// Converts little-endian 16-bit words, of which the lowest `bits` are used (12 for unpacked mono12, 16 for mono16), to
+/// mono8, rounded down.
 ///
-/// `stride` is in bytes. A value above the format's maximum is taken as white.
+/// `stride` is in bytes. A value above the maximum of the format becomes white.
+///
+/// # Errors
+/// [`ConvertError`].
 pub fn mono16(
     source: &[u8],
     width: usize,
@@ -66,9 +70,13 @@ pub fn mono16(
     Ok(())
 }
 
-/// GigE Vision's packed mono12 (`Mono12p`: two pixels in three bytes, low nibble first) to mono8; an even width only.
+/// Converts GigE Vision's packed mono12 (`Mono12p`: two pixels in three bytes, low nibble first) to mono8; the width
+/// must be even.
 ///
 /// `stride` is in bytes, at least `width * 3 / 2`.
+///
+/// # Errors
+/// [`ConvertError`].
 pub fn mono12_packed(
     source: &[u8],
     width: usize,
@@ -79,7 +87,7 @@ pub fn mono12_packed(
     if !width.is_multiple_of(2) {
         return Err(ConvertError::Format);
     }
-    // In units of pixel pairs, three bytes each.
+    // Checked in pixel pairs of three bytes.
     check(source.len(), usize::MAX, width / 2, height, stride, 3)?;
     if out.len() < width * height {
         return Err(ConvertError::TargetTooShort);
@@ -96,16 +104,19 @@ pub fn mono12_packed(
     Ok(())
 }
 
-/// An 8-bit Bayer mosaic to grey, by a 3 x 3 kernel that weighs the filters alike at every pixel.
+/// Converts an 8-bit Bayer mosaic to grey with a 3 x 3 kernel that weighs the colours equally at every pixel.
 ///
-/// Marks are black and white, so that what is wanted is not colour but an evenly weighted grey: a 3 x 3 kernel (1 2 1) on both
-/// axes gives red and blue a quarter each and green a half at every pixel, whatever the phase, and is symmetric, so that
-/// it moves no edge. So the mosaic's pattern (RGGB, BGGR, GRBG, GBRG) need not be known.
+/// Marks are black and white, so colour is not needed. The kernel (1 2 1) along both axes gives red and blue a quarter
+/// each and green a half at every pixel, whatever the phase of the mosaic; its order (RGGB, BGGR, GRBG, GBRG) need not
+/// be known. The kernel is symmetric and moves no edge.
+///
+/// # Errors
+/// [`ConvertError`].
 pub fn bayer8(source: &[u8], width: usize, height: usize, stride: usize, out: &mut [u8]) -> Result<(), ConvertError> {
     check(source.len(), out.len(), width, height, stride, 1)?;
     let row_at = |y: usize| source.get(y * stride..y * stride + width).unwrap_or(&[]);
     for (y, out) in out.chunks_exact_mut(width).take(height).enumerate() {
-        // A mirrored border keeps the filters' phase: the pixel before the first is the second.
+        // Reflection at the border keeps the phase of the mosaic: the pixel before the first is the second.
         let above = row_at(if y == 0 { 1.min(height - 1) } else { y - 1 });
         let here = row_at(y);
         let below = row_at(if y + 1 == height { height.saturating_sub(2) } else { y + 1 });
@@ -149,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn an_even_colour_becomes_an_even_grey() {
+    fn a_flat_colour_becomes_a_flat_grey() {
         // Red 200, green 100, blue 40: grey 110 at every pixel and phase, borders included.
         let (w, h) = (7, 5);
         for phase in 0..4 {
@@ -171,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn lying_sizes_are_refused() {
+    fn wrong_sizes_are_refused() {
         let mut out = [0_u8; 4];
         assert_eq!(mono16(&[0; 7], 2, 2, 4, 12, &mut out), Err(ConvertError::SourceTooShort));
         assert_eq!(mono16(&[0; 8], 2, 2, 3, 12, &mut out), Err(ConvertError::Format));

@@ -1,8 +1,6 @@
-//! What stops the loop, with its evidence and a stable code.
+//! Causes that stop the loop and latch, with their evidence and stable codes.
 
-use core::fmt;
-
-/// Why the loop stopped and latched: each needs its cause gone and an operator's reset.
+/// Why the loop stopped and latched. To clear it, the cause must be gone and an operator must reset.
 ///
 /// The codes are stable: logs, console and manual use them.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -11,43 +9,43 @@ pub enum FaultCause {
     FramesStale {
         /// Age of the newest result's image, ns.
         age_ns: u64,
-        /// Greatest allowed age, ns.
+        /// Largest allowed age, ns.
         limit_ns: u64,
     },
-    /// F-CAM-02: stamps from the future, or far in the past.
+    /// F-CAM-02: capture stamps in the future or far in the past.
     FrameStamps {
-        /// Results refused in a row.
+        /// Consecutive refused results.
         count: u32,
     },
-    /// F-MRK-01: the marks jumped further than the arm can move.
+    /// F-MRK-01: the marks jumped farther than the arm can move.
     MarksJumped {
         /// Length of the jump, metres (unit-scaled).
         jump_m: f64,
-        /// Greatest possible, metres.
+        /// Largest possible motion, metres (unit-scaled).
         limit_m: f64,
     },
-    /// F-CAM-03: a camera was moved since the set-point was given: what was planned is no longer where the images say.
+    /// F-CAM-03: a camera was moved after the set-point was given, so that the plan no longer fits the images.
     CameraMoved {
-        /// How far that leads the gripper astray, metres (unit-scaled).
+        /// Error of the gripper's position that this would cause, metres (unit-scaled).
         astray_m: f64,
     },
-    /// F-MRK-02: the images and the joints disagree about the motion (frozen image, wrong camera, slipping mount).
+    /// F-MRK-02: images and joints disagree about the motion (frozen image, wrong camera, loose mounting).
     MotionMismatch {
         /// Motion by the joints over the window, metres (unit-scaled).
         joints_m: f64,
         /// Disagreement, metres (unit-scaled).
         difference_m: f64,
     },
-    /// F-LAW-01: the gripper does not go where it is sent: a sign, frame or mounting is wrong.
+    /// F-LAW-01: the gripper does not move as commanded: a sign, a frame or the mounting is wrong.
     WrongWay {
-        /// Share of the intended motion that was seen; 1 is right, -1 the opposite.
+        /// Fraction of the intended motion that was seen: 1 is right, -1 is the opposite direction.
         agreement: f64,
         /// Motion since the start, metres (unit-scaled).
         moved_m: f64,
     },
-    /// F-LAW-02: the law's own numbers are not finite, or were far above its caps for long.
+    /// F-LAW-02: the law's rates are not finite or above a compiled ceiling: a defect of the program.
     LawBroken {
-        /// Cycles with such numbers in the last second.
+        /// Cycles with such rates since the last reset.
         cycles: u32,
     },
     /// F-ARM-01: the link to the robot is lost.
@@ -56,17 +54,17 @@ pub enum FaultCause {
     StateStale {
         /// Age, ns.
         age_ns: u64,
-        /// Greatest allowed age, ns.
+        /// Largest allowed age, ns.
         limit_ns: u64,
     },
-    /// F-ARM-03: our set-points do not arrive: the heartbeat echoed by the control script stopped.
+    /// F-ARM-03: set-points do not arrive: the heartbeat that the control script echoes has stopped.
     EchoStopped {
-        /// How long, ns.
+        /// For how long, ns.
         for_ns: u64,
     },
     /// F-ARM-04: set-points cannot be sent.
     SendBlocked {
-        /// Attempts in a row.
+        /// Consecutive failed attempts.
         count: u32,
     },
     /// F-ARM-05: protective stop.
@@ -90,16 +88,16 @@ pub enum FaultCause {
         /// `runtime_state`.
         runtime_state: u32,
     },
-    /// F-ARM-11: the control script reported a fault of its own.
+    /// F-ARM-11: the control script reports a fault.
     ScriptFault {
-        /// Its fault word.
+        /// Its number (docs/RTDE-REGISTERS.md).
         word: i32,
     },
     /// F-ARM-12: another program commands the robot.
     TokenChanged {
-        /// Our session's token.
+        /// Token of this session.
         expected: i32,
-        /// What was echoed.
+        /// Token that was echoed.
         found: i32,
     },
     /// F-ARM-13: the controller's clock went back: it restarted.
@@ -116,30 +114,31 @@ pub enum FaultCause {
         /// Its position error, rad.
         position: f64,
     },
-    /// F-ARM-15: the arm moves without being told to.
+    /// F-ARM-15: the arm moves without a command.
     Uncommanded {
         /// The fastest joint, 0 to 5.
         joint: u8,
         /// Its velocity, rad/s.
         velocity: f64,
     },
-    /// F-ARM-16: a robot value is not a number, out of range, or jumped.
+    /// F-ARM-16: a value of the robot state is NaN, out of range, or jumped.
     StateAbsurd {
-        /// The joint, 0 to 5; 6 where it is no joint's value.
+        /// The joint, 0 to 5; 6 for a value that belongs to no joint.
         joint: u8,
         /// The value.
         value: f64,
     },
-    /// F-ARM-17: the controller's own speed of its tool point is another than ours: our kinematics are not this arm's.
+    /// F-ARM-17: the controller's speed of its tool point differs from the one computed here: the configured kinematics
+    /// are not those of this arm.
     ToolSpeed {
         /// By the controller, m/s.
         controller_m_per_s: f64,
-        /// By our kinematics, m/s.
+        /// By the configured kinematics, m/s.
         ours_m_per_s: f64,
     },
-    /// F-TIM-01: the loop was not run for too long.
+    /// F-TIM-01: the loop did not run for too long.
     Stalled {
-        /// How long, ns.
+        /// For how long, ns.
         for_ns: u64,
     },
     /// F-TIM-02: time went backwards.
@@ -183,312 +182,14 @@ impl FaultCause {
     }
 }
 
-/// The control script's fault words (docs/RTDE-REGISTERS.md).
-const fn script_fault(word: i32) -> &'static str {
-    match word {
-        1 => "a joint rate is not a number or above its limit",
-        2 => "the acceleration is not a number or out of range",
-        3 => "unknown mode word",
-        4 => "it heard no new set-point in time: check the network",
-        5 => "somebody else writes its registers",
-        6 => "the outputs word means nothing",
-        7 => "a joint target is not a number or too far away",
-        8 => "nobody shook hands in time",
-        _ => "a fault that this version does not know",
-    }
-}
-
-/// In words, with the figures, and what to do. Formatting happens outside the loop.
-impl fmt::Display for FaultCause {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let ms = |ns: &u64| *ns as f64 * 1e-6;
-        match self {
-            FaultCause::FramesStale { age_ns, limit_ns } => write!(
-                f,
-                "the newest usable image is {:.0} ms old (limit {:.0} ms): check the cameras",
-                ms(age_ns),
-                ms(limit_ns)
-            ),
-            FaultCause::FrameStamps { count } => {
-                write!(f, "{count} images in a row with impossible time stamps: check the camera driver's clock")
-            }
-            FaultCause::CameraMoved { astray_m } => write!(
-                f,
-                "a camera was moved since the set-point was given, which would lead the gripper {:.1} mm astray: fix the camera, check the calibration, take new images and plan again",
-                astray_m * 1e3
-            ),
-            FaultCause::MarksJumped { jump_m, limit_m } => write!(
-                f,
-                "the marks jumped by {:.1} mm, more than the arm can move ({:.1} mm)",
-                jump_m * 1e3,
-                limit_m * 1e3
-            ),
-            FaultCause::MotionMismatch { joints_m, difference_m } => write!(
-                f,
-                "the arm moved by {:.1} mm and the images disagree by {:.1} mm: an image stands still, or the gripper's mounting is wrong",
-                joints_m * 1e3,
-                difference_m * 1e3
-            ),
-            FaultCause::WrongWay { agreement, moved_m } => write!(
-                f,
-                "the gripper does not go where it is sent (agreement {agreement:.2} after {:.1} mm): check flange_from_gripper, the arm's model and the marks",
-                moved_m * 1e3
-            ),
-            FaultCause::LawBroken { cycles } => {
-                write!(f, "the law gave unusable numbers in {cycles} cycles of one second")
-            }
-            FaultCause::LinkLost => write!(f, "the link to the robot is lost"),
-            FaultCause::StateStale { age_ns, limit_ns } => {
-                write!(f, "robot state is {:.1} ms old (limit {:.1} ms): check the network", ms(age_ns), ms(limit_ns))
-            }
-            FaultCause::EchoStopped { for_ns } => {
-                write!(f, "the control script has not seen a new set-point for {:.0} ms", ms(for_ns))
-            }
-            FaultCause::SendBlocked { count } => write!(f, "{count} set-points in a row could not be sent"),
-            FaultCause::ProtectiveStop => write!(f, "protective stop: look at the pendant, then recover"),
-            FaultCause::EmergencyStop => write!(f, "emergency stop: release it on purpose, then recover"),
-            FaultCause::SafeguardStop => write!(f, "safeguard stop: clear the safeguard, then recover"),
-            FaultCause::SafetyFault { bits } => write!(f, "the controller reports a safety fault (bits {bits:#x})"),
-            FaultCause::NotRunning { mode } => write!(f, "the robot left mode running (robot_mode {mode})"),
-            FaultCause::ProgramStopped { runtime_state } => {
-                write!(f, "the control script was stopped or paused (runtime_state {runtime_state})")
-            }
-            FaultCause::ScriptFault { word } => {
-                write!(f, "the control script reports fault {word}: {}", script_fault(*word))
-            }
-            FaultCause::TokenChanged { expected, found } => {
-                write!(f, "another program commands the robot (token {found}, ours is {expected})")
-            }
-            FaultCause::ClockBack { by_s } => {
-                write!(f, "the controller's clock went back by {by_s:.3} s: it restarted")
-            }
-            FaultCause::TrackingError { joint, velocity, position } => {
-                write!(f, "joint {joint} does not follow: {velocity:.3} rad/s, {position:.3} rad off its set-points")
-            }
-            FaultCause::Uncommanded { joint, velocity } => {
-                write!(f, "joint {joint} moves at {velocity:.3} rad/s without being told to")
-            }
-            FaultCause::StateAbsurd { joint, value } => write!(f, "robot value of joint {joint} is absurd: {value}"),
-            FaultCause::ToolSpeed { controller_m_per_s, ours_m_per_s } => write!(
-                f,
-                "the controller says that its TCP moves at {controller_m_per_s:.3} m/s, by our kinematics it is {ours_m_per_s:.3} m/s: \
-                 arm.kinematics is not this arm's"
-            ),
-            FaultCause::Stalled { for_ns } => write!(f, "the loop stood still for {:.1} ms", ms(for_ns)),
-            FaultCause::TimeBack => write!(f, "the monotonic clock went back"),
-            FaultCause::Internal => write!(f, "a defect was caught inside the daemon; see the log"),
-        }
-    }
-}
-
-/// Why the loop stopped and waits for an operator to go on; nothing is latched.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum HoldCause {
-    /// H-01: too few marks are seen.
-    MarksLost,
-    /// H-10: the law got fewer image points than it needs.
-    FewPoints {
-        /// Image points in the images in use (a mark in one view is one).
-        points: u8,
-        /// Points needed.
-        needed: u8,
-    },
-    /// H-11: the law found no finite solution in this cycle.
-    NoSolution,
-    /// H-15: the controller leaves out too many of its states (R11).
-    StatesMissing {
-        /// Share that came in the last second, 0 to 1.
-        share: f64,
-    },
-    /// H-02: the marks seen do not fix the motion (B12).
-    Geometry {
-        /// Smallest singular value, px/m.
-        sigma_min: f64,
-        /// Condition number.
-        condition: f64,
-    },
-    /// H-03: the arm is at a singularity (B11).
-    Singular {
-        /// Smallest singular value, m/s per rad/s.
-        sigma_min: f64,
-        /// The joint to bend away, 0 to 5.
-        joint: u8,
-    },
-    /// H-04: a joint is at the end of its range (B07).
-    JointEnd {
-        /// The joint, 0 to 5.
-        joint: u8,
-        /// Its position, rad.
-        position: f64,
-    },
-    /// H-05: no progress above the tolerance (G12).
-    NoProgress {
-        /// What is left, metres (unit-scaled).
-        left_m: f64,
-    },
-    /// H-06: the speed slider is at zero (B05).
-    SliderZero,
-    /// H-07: cycles were missed too often (T02).
-    Overruns {
-        /// Cycles missed in the last second.
-        count: u32,
-    },
-    /// H-08: images of the two eyes are too far apart in time (C06).
-    Skew {
-        /// Difference, ns.
-        skew_ns: u64,
-    },
-    /// H-09: the operator's lease ran out (O03).
-    LeaseLost,
-    /// H-13: encoders and images disagree as if a camera had moved; at rest it will be known.
-    CameraSuspect,
-    /// H-12: both views are to be used and one shows too few marks: depth would come from one view, ten times as poor.
-    OneView {
-        /// Marks seen, left and right.
-        seen: [u8; 2],
-    },
-}
-
-impl HoldCause {
-    /// The stable code.
-    pub const fn code(&self) -> &'static str {
-        match self {
-            HoldCause::MarksLost => "H-01",
-            HoldCause::FewPoints { .. } => "H-10",
-            HoldCause::NoSolution => "H-11",
-            HoldCause::StatesMissing { .. } => "H-15",
-            HoldCause::Geometry { .. } => "H-02",
-            HoldCause::Singular { .. } => "H-03",
-            HoldCause::JointEnd { .. } => "H-04",
-            HoldCause::NoProgress { .. } => "H-05",
-            HoldCause::SliderZero => "H-06",
-            HoldCause::Overruns { .. } => "H-07",
-            HoldCause::Skew { .. } => "H-08",
-            HoldCause::LeaseLost => "H-09",
-            HoldCause::OneView { .. } => "H-12",
-            HoldCause::CameraSuspect => "H-13",
-        }
-    }
-}
-
-impl fmt::Display for HoldCause {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            HoldCause::MarksLost => write!(f, "the marks are not seen: clear the view, then servo again"),
-            HoldCause::FewPoints { points, needed } => write!(
-                f,
-                "only {points} marks are seen in the images in use, {needed} are needed: clear the view, then servo again"
-            ),
-            HoldCause::CameraSuspect => write!(
-                f,
-                "images and joints disagree as if a camera had been moved; if status says that one was, plan again, else servo again (often: check flange_from_gripper and the images' time stamps)"
-            ),
-            HoldCause::OneView { seen } => write!(
-                f,
-                "only one view shows the marks ({} left, {} right) and both are to be used: clear the view, or check whether that camera was moved; to go on with one, set views to it",
-                seen[0], seen[1]
-            ),
-            HoldCause::NoSolution => {
-                write!(f, "the law found no finite solution: stop, and look at rig and gripper files")
-            }
-            HoldCause::StatesMissing { share } => write!(
-                f,
-                "only {:.0} % of the controller's states came within a second: look at its load and at the network",
-                share * 100.0
-            ),
-            HoldCause::Geometry { sigma_min, condition } => write!(
-                f,
-                "the marks seen do not fix the motion (sigma {sigma_min:.1} px/m, condition {condition:.0}): show more marks"
-            ),
-            HoldCause::Singular { sigma_min, joint } => {
-                write!(f, "the arm is at a singularity (sigma {sigma_min:.4}): move joint {joint} away by hand")
-            }
-            HoldCause::JointEnd { joint, position } => {
-                write!(f, "joint {joint} is at the end of its range ({position:.3} rad)")
-            }
-            HoldCause::NoProgress { left_m } => write!(f, "no progress with {:.2} mm left", left_m * 1e3),
-            HoldCause::SliderZero => write!(f, "the speed slider is at zero"),
-            HoldCause::Overruns { count } => write!(f, "{count} cycles were missed within one second"),
-            HoldCause::Skew { skew_ns } => {
-                write!(f, "the two eyes' images are {:.1} ms apart", *skew_ns as f64 * 1e-6)
-            }
-            HoldCause::LeaseLost => write!(f, "the operator's lease ran out"),
-        }
-    }
-}
-
-/// Why a request is refused; nothing changed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Reject {
-    /// Not in this mode.
-    WrongMode,
-    /// No set-point is loaded.
-    NoSetPoint,
-    /// Marks are not tracked.
-    NoMarks,
-    /// The robot is not ready: no link, no state, not running, no program.
-    RobotNotReady,
-    /// The fault's cause is still there.
-    CausePresent,
-    /// A set-point cannot change while the arm moves.
-    Moving,
-    /// The set-point is not made of finite numbers, or shows too few marks.
-    BadSetPoint,
-    /// The goal, or the way to it, is out of the arm's reach or range.
-    OutOfReach,
-    /// Too few marks stay in the images on the way.
-    PathLeavesView,
-    /// Data has not been good for long enough since the hold.
-    Settling,
-    /// A number in the request is not finite or out of range.
-    BadValue,
-    /// A camera was moved since the set-point was given.
-    CameraMoved,
-    /// Both views are to be used and one shows too few marks.
-    OneView,
-    /// The controller leaves out too many of its states.
-    StatesMissing,
-    /// The gripper is closed on something: open it before the arm may leave.
-    GripperClosed,
-}
-
-impl Reject {
-    /// In words, with what to do.
-    pub const fn reason(self) -> &'static str {
-        match self {
-            Reject::WrongMode => "not possible in this mode",
-            Reject::NoSetPoint => "no set-point is loaded: send a plan first",
-            Reject::NoMarks => "the marks are not tracked: check the images and the gripper file",
-            Reject::RobotNotReady => "the robot is not ready: power on, release the brakes, start the control script",
-            Reject::CausePresent => "the cause of the fault is still there",
-            Reject::Moving => "the set-point cannot change while the arm moves: stop first",
-            Reject::BadSetPoint => "the set-point is incomplete or shows too few marks",
-            Reject::OutOfReach => "the goal or the way to it is out of the arm's reach: move the part or the arm",
-            Reject::PathLeavesView => "too few marks stay in the images on the way: move the arm closer or the rig",
-            Reject::Settling => "wait until images and robot state have been good for 200 ms",
-            Reject::CameraMoved => {
-                "a camera was moved since the set-point was given: check the calibration, take new images and plan again"
-            }
-            Reject::OneView => {
-                "only one view shows the marks: clear the other, or check whether its camera was moved; or set views to the one that does"
-            }
-            Reject::GripperClosed => {
-                "the gripper is closed on something, or its outputs do not show that it is open: open it first"
-            }
-            Reject::StatesMissing => {
-                "the controller leaves out too many of its states: look at its load and at the network"
-            }
-            Reject::BadValue => "a value of the request is out of range",
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    extern crate std;
     use super::*;
+    use std::format;
 
     #[test]
-    fn codes_are_all_different() {
+    fn codes_are_unique_and_have_a_text() {
         let faults = [
             FaultCause::FramesStale { age_ns: 0, limit_ns: 0 },
             FaultCause::FrameStamps { count: 0 },
@@ -519,6 +220,7 @@ mod tests {
             FaultCause::Internal,
         ];
         for (i, a) in faults.iter().enumerate() {
+            assert!(!format!("{a}").is_empty(), "{} has no text", a.code());
             assert!(faults[..i].iter().all(|b| a.code() != b.code()), "{}", a.code());
         }
     }

@@ -1,8 +1,13 @@
-//! The modes of the loop, and the one table that leads from one to another.
+//! The modes of the loop, and the table of transitions between them.
 
 mod fault;
+mod fault_text;
+mod hold;
+mod reject;
 
-pub use fault::{FaultCause, HoldCause, Reject};
+pub use fault::FaultCause;
+pub use hold::HoldCause;
+pub use reject::Reject;
 
 /// A mode.
 ///
@@ -32,31 +37,31 @@ pub enum Mode {
     Armed,
     /// The law drives the arm.
     Servoing,
-    /// The marks lie on the set-point; the loop stays closed and holds them there, also while the valve is turned.
+    /// The marks are on the set-point. The loop stays closed and holds them there, also while the valve is turned.
     Converged,
-    /// The rates shrink to zero.
+    /// The rates ramp down to zero.
     Stopping(After),
-    /// Latched: the first cause and when.
+    /// Latched, with the first cause.
     Fault(Latched),
 }
 
 /// What follows a stop.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum After {
-    /// An operator's stop: back to tracking, disarmed.
+    /// After an operator's stop: tracking, disarmed.
     Tracking,
-    /// A hold: armed still; `servo` goes on.
+    /// After a hold: still armed; `servo` continues.
     Armed(HoldCause),
-    /// A fault.
+    /// After a fault.
     Fault(Latched),
 }
 
 /// A fault's first cause.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Latched {
-    /// What it was.
+    /// The cause.
     pub cause: FaultCause,
-    /// When it was noticed, CLOCK_MONOTONIC ns.
+    /// Time of detection, CLOCK_MONOTONIC ns.
     pub at_ns: u64,
 }
 
@@ -75,7 +80,7 @@ pub enum ModeName {
 }
 
 impl ModeName {
-    /// In words, as logs and console write it.
+    /// The name in logs and console.
     pub const fn as_str(self) -> &'static str {
         match self {
             ModeName::Idle => "idle",
@@ -117,60 +122,61 @@ impl Mode {
     }
 }
 
-/// What can lead to another mode.
+/// An event that may change the mode.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Event {
     /// Marks are tracked and the robot is ready.
     Ready,
-    /// One of the two is no longer so.
+    /// Marks are not tracked or the robot is not ready.
     NotReady,
-    /// Operator: arm; `Err` says what is missing.
+    /// Operator: arm; `Err` with what is missing.
     Arm(Result<(), Reject>),
     /// Operator: disarm.
     Disarm,
-    /// Operator: go; `Err` says what is missing.
+    /// Operator: start the motion; `Err` with what is missing.
     Servo(Result<(), Reject>),
     /// Operator: stop. Never refused.
     Stop,
-    /// Operator: clear the fault; whether its cause is gone.
+    /// Operator: clear the fault.
     Reset {
         /// Whether the cause is gone.
         cause_gone: bool,
     },
-    /// The last leg is done and the error is small.
+    /// The last leg has ended and the error is small.
     Reached,
     /// The error grew again.
     Receded,
-    /// The rates have come to zero.
+    /// The rates are zero.
     AtRest,
-    /// Something asks for a stop that the operator may end.
+    /// A cause for a stop after which the operator may continue.
     Hold(HoldCause),
-    /// Something asks for a stop that latches.
+    /// A cause for a stop that latches.
     Fault(FaultCause),
 }
 
-/// What a step asks the caller to do.
+/// What the caller has to do after a step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Action {
     /// Nothing.
     None,
-    /// The mode changed; nothing else is to be done.
+    /// The mode changed; nothing else to do.
     Changed,
     /// The mode changed: begin the motion (the path starts where the gripper is).
     Begin,
     /// The mode changed: ramp down.
     RampDown,
-    /// The request is refused and the mode is as it was.
+    /// The request is refused; the mode has not changed.
     Refuse(Reject),
 }
 
-/// The next mode and what to do, for every mode and every event.
+/// The next mode and the action, for every mode and every event.
 ///
-/// Total: a pair that the table does not name leaves the mode alone, and a request among those is refused.
+/// Every pair is defined: one that no rule names leaves the mode unchanged, and refuses the event if it is a request.
 pub const fn step(mode: Mode, event: Event, now_ns: u64) -> (Mode, Action) {
     use Mode::{Armed, Converged, Fault, Idle, Servoing, Stopping, Tracking};
     match (mode, event) {
-        // A fault latches wherever the arm is or was to be driven; where it is not, lacking readiness says the same.
+        // A fault latches in every mode in which the arm is armed or driven. In the others, lost readiness has the same
+        // effect.
         (Servoing | Converged, Event::Fault(cause)) => {
             (Stopping(After::Fault(Latched { cause, at_ns: now_ns })), Action::RampDown)
         }
@@ -182,7 +188,7 @@ pub const fn step(mode: Mode, event: Event, now_ns: u64) -> (Mode, Action) {
         (Servoing | Converged, Event::Hold(cause)) => (Stopping(After::Armed(cause)), Action::RampDown),
         (_, Event::Hold(_)) => (mode, Action::None),
 
-        // A stop is never refused. It makes a hold final, and leaves a fault a fault.
+        // A stop is never refused. After a hold it disarms; it does not clear a fault.
         (Servoing | Converged, Event::Stop) => (Stopping(After::Tracking), Action::RampDown),
         (Stopping(After::Armed(_)), Event::Stop) => (Stopping(After::Tracking), Action::None),
         (Armed, Event::Stop) => (Tracking, Action::Changed),
@@ -198,7 +204,7 @@ pub const fn step(mode: Mode, event: Event, now_ns: u64) -> (Mode, Action) {
         (_, Event::Reset { .. }) => (mode, Action::Refuse(Reject::WrongMode)),
 
         (Idle, Event::Ready) => (Tracking, Action::Changed),
-        // Armed stays armed while marks are hidden: `servo` will be refused until they are back.
+        // Armed stays armed while the marks are hidden; `servo` is refused until they are seen again.
         (Tracking, Event::NotReady) => (Idle, Action::Changed),
         (_, Event::Ready | Event::NotReady) => (mode, Action::None),
 
@@ -254,8 +260,8 @@ mod tests {
         Event::Fault(CAUSE),
     ];
 
-    /// One letter a cell: where each pair leads. Idle, Tracking, Armed, Servoing, Converged, Stopping (t, a, f by what follows),
-    /// Fault; `.` stays, `x` is refused. Columns as in `EVENTS`.
+    /// The next mode of each pair, one letter each: Idle, Tracking, Armed, Servoing, Converged, Stopping (t, a, f by
+    /// what follows), Fault; `.` unchanged, `x` refused. Columns as in `EVENTS`.
     const TABLE: [&str; 9] = [
         "T.xxxxx.xx.....", // Idle
         ".IAxxxx.xx.....", // Tracking
@@ -283,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn every_mode_meets_every_event_as_the_table_says() {
+    fn every_pair_of_mode_and_event_follows_the_table() {
         for (mode, row) in MODES.iter().zip(TABLE) {
             assert_eq!(row.len(), EVENTS.len(), "{mode:?}");
             for (event, want) in EVENTS.iter().zip(row.chars()) {
@@ -297,7 +303,7 @@ mod tests {
                     c => {
                         assert_eq!(letter(&next), c, "{mode:?} {event:?}");
                         assert!(!matches!(action, Action::Refuse(_)));
-                        // Motion begins, and ends, with an action that says so.
+                        // Every start and every end of motion has its action.
                         assert_eq!(
                             matches!(action, Action::Begin),
                             next.drives() && !matches!(event, Event::Reached | Event::Receded)
@@ -324,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn only_arm_then_servo_leads_from_rest_to_motion() {
+    fn motion_starts_only_by_arm_and_then_servo() {
         for mode in MODES {
             for event in EVENTS {
                 let (next, _) = step(mode, event, 0);

@@ -1,4 +1,4 @@
-//! Two cheap looks at an image's content: is it the same image again, and is it exposed at all.
+//! Two inexpensive checks of an image's content: whether it repeats, and whether it is exposed.
 
 use super::StereoFrame;
 use super::pose::MarkTable;
@@ -6,11 +6,12 @@ use crate::geom::View;
 use crate::gripper::MAX_MARKS;
 use crate::image::ImageView;
 
-/// Detects an image that repeats byte by byte while its sequence number counts (fault C03).
+/// Detects an image that repeats byte by byte while its sequence number advances.
 ///
-/// A few rows about each mark are hashed *where the marks were when the content last changed*: were the windows to follow the
-/// prediction, a moving arm would make a frozen image look new. A live camera's noise changes the hash at every frame, so
-/// that a run of equal ones says that the image is frozen; whether that is a fault (the arm moves) the command side decides.
+/// A few rows about each mark are hashed, at the marks' positions *when the content last changed*: with windows that
+/// follow the prediction, a moving arm would make a frozen image look new. The noise of a live camera changes the hash
+/// in every frame, so a run of equal hashes is a frozen image. Whether that is a fault (the arm moves) is decided by
+/// the caller.
 #[derive(Clone, Debug)]
 pub(crate) struct FreezeWatch {
     anchors: [[Option<(u16, u16)>; MAX_MARKS]; 2],
@@ -18,7 +19,9 @@ pub(crate) struct FreezeWatch {
     run: u32,
 }
 
+/// Half height of the hashed window, pixels.
 const HALF_ROWS: usize = 4;
+/// Half width of the hashed window, pixels.
 const HALF_COLUMNS: usize = 12;
 
 impl FreezeWatch {
@@ -26,12 +29,12 @@ impl FreezeWatch {
         Self { anchors: [[None; MAX_MARKS]; 2], hash: 0, run: 0 }
     }
 
-    /// Number of frames in a row that equalled the one before.
+    /// Number of consecutive frames equal to the one before.
     pub(crate) fn run(&self) -> u32 {
         self.run
     }
 
-    /// Takes in a frame and the marks seen in it.
+    /// Takes a frame and the marks measured in it.
     pub(crate) fn update(&mut self, frame: &StereoFrame<'_>, marks: &MarkTable) {
         let anchored = self.anchors.iter().flatten().any(Option::is_some);
         if anchored && self.digest(frame) == self.hash {
@@ -67,7 +70,7 @@ impl FreezeWatch {
     }
 }
 
-/// Whether an image is black, saturated, or without contrast (fault C12), from about a thousand of its pixels.
+/// Whether an image is black, saturated or without contrast, by about a thousand of its pixels.
 pub(crate) fn badly_exposed(image: &ImageView<'_>, min_contrast: f64) -> bool {
     const SIDE: usize = 32;
     let (mut black, mut white, mut low, mut high) = (0_u32, 0_u32, 255_u8, 0_u8);
@@ -82,6 +85,6 @@ pub(crate) fn badly_exposed(image: &ImageView<'_>, min_contrast: f64) -> bool {
         }
     }
     let all = (SIDE * SIDE) as u32;
-    // A dark room behind the part is no fault, hence nearly all for black; half of an image burnt out is one.
+    // A dark background is no fault, so nearly all pixels must be black; half of them saturated is a fault.
     black * 20 > all * 19 || white * 2 > all || f64::from(high.saturating_sub(low)) < min_contrast
 }

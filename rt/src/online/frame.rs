@@ -1,9 +1,12 @@
-//! One stereo pair as it comes from shared memory, and the reasons for which it is not even looked at.
+//! The stereo pair that the tracker takes, and the checks before it is searched.
+//!
+//! The tracker makes these checks because it also runs on recordings and in tests. On frames from shared memory, the
+//! frame topic has already checked the bytes (`graspd_shm::frame::check`).
 
 use crate::geom::{Rig, View};
 use crate::image::ImageView;
 
-/// A stereo pair, borrowed for the time of one step.
+/// A stereo pair, borrowed for one step of the tracker.
 #[derive(Clone, Copy, Debug)]
 pub struct StereoFrame<'a> {
     /// The left image.
@@ -12,7 +15,7 @@ pub struct StereoFrame<'a> {
     pub right: ImageView<'a>,
     /// The publisher's sequence number.
     pub sequence: u64,
-    /// When each eye's image was taken (mid-exposure), CLOCK_MONOTONIC nanoseconds.
+    /// Middle of the exposure of left and right, CLOCK_MONOTONIC nanoseconds.
     pub capture_ns: [u64; 2],
     /// The time now, CLOCK_MONOTONIC nanoseconds.
     pub now_ns: u64,
@@ -28,14 +31,14 @@ impl<'a> StereoFrame<'a> {
     }
 }
 
-/// What a stereo pair's stamps may be.
+/// Limits of a stereo pair's time stamps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FrameLimits {
-    /// Largest time between the two eyes, nanoseconds. Default 5 ms.
+    /// Largest time between the exposures of left and right, nanoseconds. Default 5 ms.
     pub max_skew_ns: u64,
-    /// Oldest capture that is still looked at, nanoseconds. Default 1 s.
+    /// Largest age of a capture, nanoseconds. Default 1 s.
     pub max_age_ns: u64,
-    /// How far a stamp may lie in the future (clock reading order, not clock error), nanoseconds. Default 2 ms.
+    /// How far a stamp may be in the future, nanoseconds. Default 2 ms: two threads read the clock one after the other.
     pub max_ahead_ns: u64,
 }
 
@@ -45,89 +48,89 @@ impl Default for FrameLimits {
     }
 }
 
-/// Why a stereo pair was refused; the fault catalogue's numbers are in brackets.
+/// Why a stereo pair, or the pose found in it, was refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FrameReject {
-    /// An image has not the size of the rig's camera \[C08\].
+    /// Image size mismatch with the rig's camera.
     Size {
-        /// Which view.
+        /// The view.
         view: View,
-        /// Width and height found.
+        /// Width and height of the image.
         found: [u32; 2],
         /// Width and height of the calibration.
         expected: [u32; 2],
     },
-    /// The sequence number repeats or goes back \[C04\].
+    /// The sequence number repeats or goes back.
     Sequence {
-        /// The last accepted number.
+        /// Last accepted number.
         last: u64,
-        /// The number of this pair.
+        /// Number of this pair.
         got: u64,
     },
-    /// A capture stamp is not later than the last accepted one of its eye \[C04, C11\].
+    /// A capture stamp is not later than the last accepted one of its view.
     NotLater {
-        /// Which view.
+        /// The view.
         view: View,
     },
-    /// The eyes are too far apart in time \[C06\].
+    /// The exposures of left and right are too far apart in time.
     Skew {
-        /// Time between the eyes, nanoseconds.
+        /// Time between the exposures, nanoseconds.
         ns: u64,
     },
-    /// The pair is too old \[C10\].
+    /// The pair is too old.
     Stale {
         /// Its age, nanoseconds.
         ns: u64,
     },
-    /// A stamp lies in the future \[C10\].
+    /// A stamp is in the future.
     Future {
         /// How far, nanoseconds.
         ns: u64,
     },
-    /// The marks were found, farther from the last pose than the gripper can have moved \[M03, M05\].
+    /// The marks were found farther from the last pose than the gripper can have moved.
     Jump {
         /// Distance, micrometres.
         um: u32,
-        /// Turn, milliradians.
+        /// Rotation, milliradians.
         mrad: u32,
     },
 }
 
-/// Counts of what was wrong with frames since start; a plain value for telemetry.
+/// Counters of refused and degraded frames since start, for telemetry.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct FrameFaults {
     /// Pairs accepted.
     pub accepted: u64,
-    /// Pairs that never arrived, by gaps of the sequence number.
+    /// Pairs that never arrived, counted by gaps of the sequence number.
     pub skipped: u64,
-    /// Pairs of a wrong size.
+    /// Pairs with an image size mismatch.
     pub size: u64,
     /// Pairs with a repeated or smaller sequence number.
     pub sequence: u64,
     /// Pairs whose stamps did not advance.
     pub not_later: u64,
-    /// Pairs with too much time between the eyes.
+    /// Pairs with too much time between the exposures.
     pub skew: u64,
     /// Pairs too old on arrival.
     pub stale: u64,
     /// Pairs stamped in the future.
     pub future: u64,
-    /// Poses refused as physically impossible jumps.
+    /// Poses refused because the gripper cannot move that far.
     pub jump: u64,
-    /// Pairs that were black, saturated or without contrast \[C12\].
+    /// Pairs that were black, saturated or without contrast.
     pub exposure: u64,
     /// Pairs in which the marks were lost.
     pub lost: u64,
-    /// Joint predictions that contradicted the last pose and were not used.
+    /// Predictions by the joints that contradicted the last pose and were not used.
     pub prior: u64,
-    /// Mark observations thrown out as inconsistent with the other marks \[M04, M08\].
+    /// Mark observations dropped as inconsistent with the other marks.
     pub outliers: u64,
-    /// Rejects since the last accepted pair.
+    /// Consecutive refused pairs.
     pub in_a_row: u32,
 }
 
 impl FrameFaults {
-    /// Adds one reject.
+    /// Counts one refusal.
     pub(crate) fn count(&mut self, reject: &FrameReject) {
         let n = match reject {
             FrameReject::Size { .. } => &mut self.size,
@@ -143,14 +146,14 @@ impl FrameFaults {
     }
 }
 
-/// What the last accepted pair was.
+/// Sequence number and stamps of the last accepted pair.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct LastFrame {
     pub(crate) sequence: u64,
     pub(crate) capture_ns: [u64; 2],
 }
 
-/// Checks a pair's sizes and stamps against the rig, the limits, and the last accepted pair.
+/// Compares a pair's sizes and stamps with the rig, the limits and the last accepted pair.
 pub(crate) fn check(
     frame: &StereoFrame<'_>,
     rig: &Rig,

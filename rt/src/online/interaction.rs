@@ -1,7 +1,8 @@
-//! Image Jacobian of a mark for a rig that stands and a gripper that moves.
+//! Interaction matrix of a mark for fixed cameras and a moving gripper (eye-to-hand).
 //!
-//! The one place where the sign of the servo is decided. A point `X` fixed in the gripper moves, in the gripper frame's axes,
-//! with `v + w x X` under the gripper's screw `xi = [v; w]`; the camera sees it turned by `R = camera_from_gripper`:
+//! The sign of the servo is decided here and nowhere else. A point `X` fixed in the gripper moves with `v + w x X` (in
+//! the axes of the gripper frame) under the gripper's screw `xi = [v; w]`; `R`, the rotation of `camera_from_gripper`,
+//! takes it to the camera frame:
 //!
 //! ```text
 //!            |1/Z   0   -x/Z|
@@ -9,13 +10,13 @@
 //!            | 0   1/Z  -y/Z|
 //! ```
 //!
-//! The sign is plus. The matrix of an eye in the hand, found in most texts, has a minus in front because there the camera moves
-//! and the point stands. Pixels put the lens in front: `L_px = (d pixel / d normalized) L`, distortion included.
+//! The sign is plus. The eye-in-hand matrix of most textbooks has a minus in front, because there the camera moves and
+//! the point is fixed. For pixels the lens is applied: `L_px = (d pixel / d normalized) L`, distortion included.
 
 use crate::geom::{Camera, Pixel, Pose, Vec3};
 use nalgebra::{Matrix2x6, Matrix3};
 
-/// A camera and where the gripper stands in it: what every mark of one view has in common.
+/// A camera and the gripper's pose in it: common to all marks of one view.
 #[derive(Clone, Copy, Debug)]
 pub struct PlacedView<'a> {
     camera: &'a Camera,
@@ -38,19 +39,20 @@ impl<'a> PlacedView<'a> {
         self.camera.project(&(self.rotation * x_gripper + self.translation))
     }
 
-    /// Whether a flat mark at `x_gripper` with outward `normal` turns its face to this camera.
+    /// Whether a flat mark at `x_gripper` with outward `normal` (gripper frame) faces this camera.
     pub fn faces(&self, x_gripper: &Vec3, normal: &Vec3) -> bool {
         let x = self.rotation * x_gripper + self.translation;
         (self.rotation * normal).dot(&x) < 0.0
     }
 
-    /// Whether a pixel lies inside the image by `margin` pixels.
+    /// Whether a pixel is inside the image by at least `margin` pixels.
     pub fn contains(&self, pixel: Pixel, margin: f64) -> bool {
         self.camera.contains(pixel, margin)
     }
 
-    /// Pixel of a point of the gripper, and `L` (2x6, px/s per m/s and per rad/s): `ds/dt = L xi`, `xi` the gripper's screw
-    /// relative to the rig at the gripper's origin, expressed in the gripper frame. Paper section 5; sign as printed above.
+    /// Pixel of a point of the gripper (metres, gripper frame), and its interaction matrix `L` (2x6, px/s per m/s and
+    /// per rad/s): `ds/dt = L xi`, where `xi` is the gripper's screw relative to the rig, at the gripper's origin, in
+    /// the gripper frame. Paper section 5; sign as above.
     ///
     /// `None` at or behind the projection centre.
     pub fn interaction(&self, x_gripper: &Vec3) -> Option<(Pixel, Matrix2x6<f64>)> {
@@ -58,7 +60,7 @@ impl<'a> PlacedView<'a> {
         let by_shift = by_point * self.rotation;
         let mut l = Matrix2x6::zeros();
         for row in 0..2 {
-            // -a^T [X]x = (X x a)^T: turning by w moves the pixel as w . (X x a) says.
+            // -a^T [X]x = (X x a)^T: a rotation w moves the pixel by w . (X x a).
             let a = Vec3::new(by_shift[(row, 0)], by_shift[(row, 1)], by_shift[(row, 2)]);
             let turn = x_gripper.cross(&a);
             for k in 0..3 {
@@ -76,7 +78,7 @@ mod tests {
     use crate::geom::{Distortion, Twist, exp_twist};
     use crate::math;
 
-    /// Gradients only: `L` against finite differences of the projection along each component of the screw.
+    /// `L` agrees with finite differences of the projection along each component of the screw.
     #[test]
     fn agrees_with_finite_differences_under_lens_distortion() {
         let camera = Camera {
@@ -108,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mark_moved_to_the_right_goes_to_the_right() {
+    fn a_mark_that_moves_right_moves_right_in_the_image() {
         let camera = Camera {
             width: 100,
             height: 100,

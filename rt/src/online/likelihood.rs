@@ -1,18 +1,19 @@
-//! Likelihoods of pose and rig together, in units in which all unknowns are of one size: what lets a step be told from none.
+//! Likelihood of pose and rig together, in units in which all unknowns have the same size: the test for a step of the
+//! rig.
 
 use super::rig_fit::{Joint, JointVector, RigMatrix, UNKNOWNS};
 use crate::geom::RIG_UNKNOWNS;
 use crate::math;
 use nalgebra::{Matrix6, SMatrix, SVector};
 
-/// How far a camera may be moved, one deviation, and the unit of each unknown in here: the whole rig by 10 mm and 0.6 degrees, one
-/// camera by 0.6 degrees, 0.5 % of magnification and 10 px.
+/// Standard deviation of a camera move, and the unit of each unknown in this file: the entire rig by 10 mm and 0.6
+/// degrees, one camera by 0.6 degrees, 0.5 % of focal length and 10 px.
 pub(super) const STEP: [f64; UNKNOWNS] =
     [1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 5e-3, 5e-3, 10.0, 10.0, 10.0, 10.0];
-/// Deviation of a pose that nothing predicts, in units of [`STEP`].
+/// Standard deviation of a pose without a prediction, in units of [`STEP`].
 pub(super) const UNKNOWN_POSE: f64 = 30.0;
 
-/// Covariance at the start: a pose that nothing predicts, the stated error.
+/// Covariance at the start: a pose without a prediction, and the stated error of the rig.
 pub(super) fn start(spread: &RigMatrix) -> Joint {
     let mut p = Joint::zeros();
     p.fixed_view_mut::<RIG_UNKNOWNS, RIG_UNKNOWNS>(6, 6).copy_from(spread);
@@ -43,7 +44,8 @@ pub(super) fn scaled_vector(x: &JointVector) -> JointVector {
     JointVector::from_fn(|i, _| x[i] * STEP[i])
 }
 
-/// Chi-squared by which the unknowns explain more when their covariance is `wide` instead of `narrow`, and the unknowns then.
+/// Gain in chi-squared when the covariance of the unknowns is `wide` instead of `narrow`, and the unknowns with `wide`.
+/// `None` if a value is not finite.
 pub(super) fn gain<const N: usize>(
     information: &SMatrix<f64, N, N>,
     score: &SVector<f64, N>,
@@ -58,7 +60,7 @@ pub(super) fn gain<const N: usize>(
     (chi2.is_finite() && b.iter().all(|v| v.is_finite())).then_some((chi2.max(0.0), b))
 }
 
-/// Solves `m x = b` by elimination with row pivots; `None` where a pivot is nothing or no number.
+/// Solves `m x = b` by Gaussian elimination with row pivots; `None` if a pivot is zero or not finite.
 pub(super) fn solve<const N: usize, const K: usize>(
     mut m: SMatrix<f64, N, N>,
     mut b: SMatrix<f64, N, K>,

@@ -1,4 +1,21 @@
-//! The on-line stage, one file per arrow of the paper: frames in, gripper pose out.
+//! The on-line stage: stereo pairs in, gripper pose out; and the parts of the control law.
+//!
+//! In reading order:
+//!
+//! | file | content |
+//! |---|---|
+//! | `observation`, `vision` | [`MarkObservation`], [`Vision`]: values passed between files and threads |
+//! | `frame`, `content` | checks of a stereo pair: sizes and stamps, frozen and badly exposed images |
+//! | [`marks`] | measures one mark to sub-pixel |
+//! | [`pose`] | the gripper's pose from the marks of both views |
+//! | [`acquire`] | finds the marks without an earlier pose |
+//! | [`rig_fit`], `likelihood`, [`rig_watch`] | the error of the rig, and the detection of a moved camera |
+//! | `vision_cycle` | [`VisionCycle::step`]: tracks one stereo pair with all of the above |
+//! | [`predict`] | from the capture of an image to now, by the joints |
+//! | [`interaction`] | the interaction matrix of a mark: the sign of the servo |
+//! | [`path`] | the reference that moves from the gripper to the goal |
+//! | [`screw`] | the law: stacked marks to the correction of the pose |
+//! | [`rates`] | a gripper screw to joint rates |
 
 pub mod acquire;
 mod content;
@@ -6,6 +23,7 @@ mod frame;
 pub mod interaction;
 mod likelihood;
 pub mod marks;
+mod observation;
 pub mod path;
 pub mod pose;
 pub mod predict;
@@ -17,5 +35,6 @@ mod vision;
 mod vision_cycle;
 
 pub use frame::{FrameFaults, FrameLimits, FrameReject, StereoFrame};
-pub use vision::{MarkObservation, Vision, VisionStatus};
+pub use observation::{MarkObservation, RigHealth};
+pub use vision::{Vision, VisionStatus};
 pub use vision_cycle::{VisionCycle, VisionHealth, VisionSettings};

@@ -1,8 +1,9 @@
-//! The path of the reference: from where the gripper is to where it shall be, in space, seen in the images.
+//! The path of the reference from the gripper's pose to the goal: planned in space, followed in the images.
 //!
-//! The servo never chases a far goal. A reference pose moves along a leg (straight line with an even turn, or an arc round the
-//! valve's axis), the marks' images of that pose are the servo's reference features, and its velocity is fed forward. When the
-//! gripper lags, the reference waits. At the end of a leg the reference features *are* the plan's own pixels.
+//! A reference pose moves along a leg: a straight line with a uniform rotation, or an arc about the valve's axis. The
+//! pixels of the marks at that pose are the reference features of the servo, and its velocity is the feed-forward, so
+//! the image error is always small. When the gripper lags, the reference waits. At the end of a leg the reference
+//! features are the pixels of the plan.
 
 use crate::geom::{Pixel, Pose, Twist, Vec3, exp_twist, log_pose};
 use crate::math;
@@ -13,13 +14,13 @@ use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 pub struct PathSettings {
     /// Speed of the gripper along a leg, m/s. Default 0.15.
     pub speed_m_per_s: f64,
-    /// Turning speed along a leg, rad/s. Default 0.35.
+    /// Rotation speed along a leg, rad/s. Default 0.35.
     pub turn_rad_per_s: f64,
     /// Time to reach full speed from rest, seconds. Default 0.4.
     pub rise_s: f64,
-    /// Lag (unit-scaled, metres) from which the reference slows down. Default 0.008.
+    /// Lag of the gripper from which the reference slows down, metres (unit-scaled). Default 0.008.
     pub slow_lag_m: f64,
-    /// Lag at which the reference stands and waits. Default 0.025.
+    /// Lag of the gripper at which the reference stops and waits, metres (unit-scaled). Default 0.025.
     pub wait_lag_m: f64,
 }
 
@@ -32,41 +33,41 @@ impl Default for PathSettings {
 /// One leg in space; poses are `left_from_gripper`, and the leg's parameter runs from 0 to 1.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Leg {
-    /// The origin on a straight line, the rotation evenly about one axis.
+    /// The origin moves on a straight line, and the gripper rotates uniformly about one axis.
     Line {
-        /// Where it starts.
+        /// Pose at the start.
         from: Pose,
-        /// Where it ends.
+        /// Pose at the end.
         to: Pose,
-        /// The whole turn as a rotation vector in the gripper frame, rad.
+        /// Total rotation as a rotation vector in the gripper frame, rad.
         turn: Vec3,
     },
-    /// A turn about an axis fixed in the rig.
+    /// A rotation about an axis fixed in the rig.
     Arc {
-        /// Where it starts.
+        /// Pose at the start.
         from: Pose,
-        /// A point of the axis, left frame, metres.
+        /// A point on the axis, left frame, metres.
         centre: Vec3,
         /// Unit direction of the axis, left frame.
         axis: Vec3,
-        /// The whole angle, rad, right-handed about the axis.
+        /// Total angle, rad, right-handed about the axis.
         angle: f64,
     },
 }
 
-/// Rotation by a rotation vector, from this crate's own sine and cosine.
+/// Rotation by a rotation vector (rad), with the sine and cosine of this crate.
 fn rotation(v: &Vec3) -> UnitQuaternion<f64> {
     exp_twist(&Twist::new(0.0, 0.0, 0.0, v.x, v.y, v.z)).rotation
 }
 
 impl Leg {
-    /// A straight leg by the shorter turn.
+    /// A straight leg with the shorter of the two rotations.
     pub fn line(from: &Pose, to: &Pose) -> Self {
         let w = log_pose(&Pose::from_parts(Translation3::identity(), from.rotation.inverse() * to.rotation));
         Leg::Line { from: *from, to: *to, turn: Vec3::new(w[3], w[4], w[5]) }
     }
 
-    /// An arc about an axis through `centre`; `None` when the direction has no length.
+    /// An arc about an axis through `centre`; `None` if the direction has no length.
     pub fn arc(from: &Pose, centre: &Vec3, axis: &Vec3, angle: f64) -> Option<Self> {
         let n = axis.norm();
         (n > 1e-9 && n.is_finite()).then(|| Leg::Arc { from: *from, centre: *centre, axis: axis / n, angle })
@@ -89,7 +90,7 @@ impl Leg {
         }
     }
 
-    /// The reference's velocity for `ds/dt = 1`, as a screw in the reference's own gripper frame (m, rad per unit of s).
+    /// Velocity of the reference for `ds/dt = 1`, as a screw in its gripper frame (m, rad per unit of s).
     pub fn screw(&self, s: f64) -> Twist {
         let inverse = self.pose(s).rotation.inverse();
         let (v, w) = match self {
@@ -102,7 +103,7 @@ impl Leg {
         Twist::new(v.x, v.y, v.z, w.x, w.y, w.z)
     }
 
-    /// How long the leg takes at full speed, seconds.
+    /// Duration of the leg at full speed, seconds.
     pub fn seconds(&self, settings: &PathSettings) -> f64 {
         let xi = self.screw(0.0);
         let shift = xi.fixed_rows::<3>(0).norm() / settings.speed_m_per_s;
@@ -111,7 +112,8 @@ impl Leg {
     }
 }
 
-/// A reference that moves along a leg with bounded speed and acceleration, waits for a laggard, and stops at the end.
+/// A reference that moves along a leg with bounded speed and acceleration, waits when the gripper lags, and ends at
+/// rest.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reference {
     leg: Leg,
@@ -126,7 +128,7 @@ impl Reference {
     /// A reference at rest at the start of `leg`.
     pub fn new(leg: Leg, settings: &PathSettings) -> Self {
         let seconds = leg.seconds(settings);
-        // A leg of no length is at its end at once.
+        // A leg of no length has already ended.
         let (s, full) = if seconds > 1e-6 { (0.0, 1.0 / seconds) } else { (1.0, 0.0) };
         Self { leg, s, rate: 0.0, full }
     }
@@ -136,32 +138,33 @@ impl Reference {
         &self.leg
     }
 
-    /// 0 at the start to 1 at the end.
+    /// Progress along the leg, 0 to 1.
     pub fn progress(&self) -> f64 {
         self.s
     }
 
-    /// Whether the end is reached.
+    /// Whether the reference has reached the end.
     pub fn ended(&self) -> bool {
         self.s >= 1.0
     }
 
-    /// The reference pose now, `left_from_gripper`.
+    /// The current reference pose, `left_from_gripper`.
     pub fn pose(&self) -> Pose {
         self.leg.pose(self.s)
     }
 
-    /// The reference's velocity now, in its own gripper frame, m/s and rad/s.
+    /// The current velocity of the reference in its gripper frame, m/s and rad/s.
     pub fn screw(&self) -> Twist {
         self.leg.screw(self.s) * self.rate
     }
 
-    /// Stops at once where it is (the gripper's own deceleration is the guard's business).
+    /// Stops the reference immediately (the guard decelerates the arm).
     pub fn halt(&mut self) {
         self.rate = 0.0;
     }
 
-    /// Moves on by `dt_s` seconds at `scale` (0 to 1) of full speed, with the gripper lagging by `lag_m` (unit-scaled).
+    /// Advances by `dt_s` seconds at the fraction `scale` (0 to 1) of full speed; `lag_m` is the lag of the gripper
+    /// (unit-scaled).
     pub fn advance(&mut self, dt_s: f64, scale: f64, lag_m: f64, settings: &PathSettings) {
         if self.ended() || !(dt_s > 0.0 && dt_s.is_finite()) {
             self.rate = 0.0;
@@ -172,11 +175,11 @@ impl Reference {
         let scale = if scale.is_finite() { scale.clamp(0.0, 1.0) } else { 0.0 };
         let acceleration = self.full / settings.rise_s;
         let left = 1.0 - self.s;
-        // Braking curve v² = 2 a x, less what one step makes of it, so that the end is met at rest.
+        // Braking curve v² = 2 a x, lowered by one step, so that the reference reaches the end at rest.
         let one = acceleration * dt_s;
         let braking = math::sqrt(2.0 * acceleration * left + one * one) - one;
         let target = (self.full * scale * patience).min(braking);
-        // It may slow down twice as fast as it speeds up: waiting must not overshoot the gripper.
+        // Deceleration is twice the acceleration, so that a waiting reference does not run ahead of the gripper.
         let step = acceleration * dt_s;
         self.rate = target.clamp(self.rate - 2.0 * step, self.rate + step).max(0.0);
         self.s += self.rate * dt_s;
@@ -187,16 +190,16 @@ impl Reference {
     }
 }
 
-/// The share of the goal's own pixel offset that the reference carries at `s`: none at the start, all of it at the end.
+/// Weight of the goal's pixel offset in the reference at `s`: 0 at the start, 1 at the end, with zero slope at both.
 pub fn blend(s: f64) -> f64 {
     let s = s.clamp(0.0, 1.0);
     s * s * (3.0 - 2.0 * s)
 }
 
-/// Reference pixel of a mark: the image of the reference pose, and the plan's own offset carried along.
+/// Reference pixel of a mark: its projection at the reference pose plus the blended offset of the plan.
 ///
-/// `from` and `to` are what the plan's pixels differ by from the projection of their pose at the leg's start and end; at
-/// `s = 1`, with the reference on the goal pose, the result is the plan's pixel.
+/// `from` and `to` are the differences between the plan's pixel and the projection of the plan's pose, at the start and
+/// the end of the leg. At `s = 1`, with the reference at the goal pose, the result is the plan's pixel.
 pub fn reference_pixel(projection: Pixel, from: Option<Pixel>, to: Option<Pixel>, s: f64) -> Pixel {
     let b = blend(s);
     projection + from.unwrap_or_default() * (1.0 - b) + to.unwrap_or_default() * b
@@ -213,12 +216,12 @@ mod tests {
     }
 
     #[test]
-    fn legs_start_and_end_where_they_should() {
+    fn legs_start_and_end_at_their_poses() {
         let (a, b) = poses();
         let line = Leg::line(&a, &b);
         assert!(log_pose(&(line.pose(0.0).inverse() * a)).norm() < 1e-12);
         assert!(log_pose(&(line.pose(1.0).inverse() * b)).norm() < 1e-12);
-        assert!(log_pose(&(line.pose(1.0 - 1e-12).inverse() * b)).norm() < 1e-9, "the end is no jump");
+        assert!(log_pose(&(line.pose(1.0 - 1e-12).inverse() * b)).norm() < 1e-9, "continuous at the end");
         let arc = Leg::arc(&a, &Vec3::new(0.0, 0.0, 1.5), &Vec3::new(0.1, -0.3, -1.0), 0.8).unwrap();
         assert!(log_pose(&(arc.pose(0.0).inverse() * a)).norm() < 1e-12);
         let centre = Vec3::new(0.0, 0.0, 1.5);
@@ -265,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn it_waits_for_a_laggard_and_for_a_slider_at_zero() {
+    fn the_reference_waits_for_a_lagging_gripper_and_at_zero_speed() {
         let (a, b) = poses();
         let settings = PathSettings::default();
         let mut r = Reference::new(Leg::line(&a, &b), &settings);
@@ -286,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn at_the_end_the_reference_is_the_plan() {
+    fn at_the_end_the_reference_is_the_plans_pixel() {
         let (goal, projected) = (Pixel::new(10.0, 20.0), Pixel::new(11.5, 19.0));
         let offset = Some(goal - projected);
         assert!((reference_pixel(projected, None, offset, 1.0) - goal).norm() < 1e-12);

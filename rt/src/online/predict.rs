@@ -1,16 +1,16 @@
-//! Prediction from the instant of the image to now, by the arm's own encoders.
+//! Prediction of the gripper's pose from the capture of an image to now, by the arm's encoders.
 //!
-//! The image is tens of milliseconds old when its marks are known. Between its capture and now the gripper moved as the
-//! joints say, in its own frame; the rig's place relative to the robot cancels and appears nowhere. An error of the arm model
-//! scales with that short motion and vanishes at rest, so it cannot shift where the servo ends.
+//! An image is tens of milliseconds old when its marks are known. The joints give the motion of the gripper since, in
+//! its own frame; the pose of the rig relative to the robot cancels. The effect of an error in the arm model scales
+//! with that short motion and vanishes at rest, so it does not change where the servo converges.
 
 use crate::arm::{Dh, Joints};
 use crate::geom::Pose;
 
-/// Joint samples kept: half a second at 1000 Hz.
+/// Number of joint samples kept: half a second at 1000 Hz.
 pub const HISTORY: usize = 512;
 
-/// Joint positions of the recent past by time.
+/// Recent joint positions by time.
 #[derive(Clone, Debug)]
 pub struct JointHistory {
     samples: [(u64, Joints); HISTORY],
@@ -25,13 +25,13 @@ impl Default for JointHistory {
 }
 
 impl JointHistory {
-    /// Forgets everything.
+    /// Removes all samples.
     pub fn clear(&mut self) {
         self.len = 0;
         self.next = 0;
     }
 
-    /// Notes that the joints were at `q` at `at_ns`. A sample that is not newer than the last one is ignored.
+    /// Adds joint positions `q` (rad) at `at_ns`. A sample that is not newer than the last one is ignored.
     pub fn push(&mut self, at_ns: u64, q: &Joints) {
         if self.len > 0 && at_ns <= self.newest().0 {
             return;
@@ -41,7 +41,7 @@ impl JointHistory {
         self.len = (self.len + 1).min(HISTORY);
     }
 
-    /// When the newest sample was taken, ns; 0 when there is none.
+    /// Time of the newest sample, ns; 0 without samples.
     pub fn newest_ns(&self) -> u64 {
         if self.len == 0 { 0 } else { self.newest().0 }
     }
@@ -50,14 +50,14 @@ impl JointHistory {
         &self.samples[(self.next + HISTORY - 1) % HISTORY]
     }
 
-    /// The `age`-th newest sample, 0 the newest.
+    /// The `age`-th newest sample; 0 is the newest.
     fn back(&self, age: usize) -> &(u64, Joints) {
         &self.samples[(self.next + 2 * HISTORY - 1 - age) % HISTORY]
     }
 
-    /// Joint positions at `at_ns`, interpolated between the samples round it; the newest for an instant after it.
+    /// Joint positions at `at_ns`, interpolated linearly between samples; the newest sample for a later time.
     ///
-    /// `None` when the instant is older than everything kept, or nothing is. At most ten steps (a binary search).
+    /// `None` if the time is before the oldest sample, or there is none. A binary search of at most ten steps.
     pub fn at(&self, at_ns: u64) -> Option<Joints> {
         if self.len == 0 || at_ns < self.back(self.len - 1).0 {
             return None;
@@ -81,7 +81,7 @@ impl JointHistory {
     }
 }
 
-/// Gripper pose in the rig now, from its pose at capture and the joints then and now.
+/// Gripper pose in the rig now, from its pose at capture and the joint positions at capture and now.
 pub fn left_from_gripper_now(
     dh: &Dh,
     flange_from_gripper: &Pose,
@@ -97,7 +97,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn interpolates_between_samples_and_knows_its_bounds() {
+    fn interpolates_between_samples_within_its_bounds() {
         let mut h = JointHistory::default();
         assert_eq!(h.at(5), None);
         for k in 0..2000_u64 {

@@ -1,4 +1,4 @@
-//! From the gripper's screw to joint rates, through the arm's body Jacobian, with care near singularities.
+//! From the gripper's screw to joint rates by the arm's body Jacobian: damped and slowed near singularities.
 
 use crate::arm::Joints;
 use crate::geom::Twist;
@@ -8,13 +8,13 @@ use nalgebra::{Matrix6, SymmetricEigen};
 /// Settings of the inversion.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RateSettings {
-    /// Length that makes a turn comparable with a shift: 1 rad/s counts as this many m/s. Default 0.2.
+    /// Length that makes a rotation comparable with a translation: 1 rad/s counts as this many m/s. Default 0.2.
     pub length_m: f64,
-    /// Smallest singular value (m/s per rad/s) under which the motion is damped and slowed. Default 0.03.
+    /// Smallest singular value below which the motion is damped and slowed, m/s per rad/s. Default 0.03.
     pub soft_sigma: f64,
-    /// Smallest singular value at which it stops. Default 0.012.
+    /// Smallest singular value at which the motion stops, m/s per rad/s. Default 0.012.
     pub hard_sigma: f64,
-    /// Greatest damping, as a singular value. Default 0.015.
+    /// Largest damping, as a singular value. Default 0.015.
     pub damping: f64,
 }
 
@@ -24,16 +24,17 @@ impl Default for RateSettings {
     }
 }
 
-/// Joint rates, and how well the arm stands for them.
+/// Joint rates, and the condition of the arm.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rates {
-    /// Joint rates, rad/s, slowed by `scale`.
+    /// Joint rates, rad/s, with `scale` applied.
     pub rates: Joints,
     /// 1 far from singularities, falling to 0 at the hard limit.
     pub scale: f64,
     /// Smallest singular value of the unit-scaled Jacobian, m/s per rad/s.
     pub sigma_min: f64,
-    /// The joint that turns most for least effect: the one to bend away, 0 (base) to 5 (wrist 3).
+    /// The joint that moves most in the weakest direction, which is the one to move away from the singularity: 0 (base)
+    /// to 5 (wrist 3).
     pub joint: u8,
 }
 
@@ -44,14 +45,15 @@ pub enum RateError {
     Singular {
         /// Smallest singular value, m/s per rad/s.
         sigma_min: f64,
-        /// The joint that turns most for least effect, 0 to 5.
+        /// The joint that moves most in the weakest direction, 0 to 5.
         joint: u8,
     },
-    /// Something is not a finite number.
+    /// A value is not finite.
     NotFinite,
 }
 
-/// Smallest singular value of a unit-scaled body Jacobian and the joint that turns most along it; `None` when not finite.
+/// Smallest singular value of the unit-scaled body Jacobian, m/s per rad/s, and the joint that moves most in its
+/// direction; `None` if a value is not finite.
 pub fn singularity(jacobian: &Matrix6<f64>, settings: &RateSettings) -> Option<(f64, u8)> {
     let mut j = *jacobian;
     for r in 3..6 {
@@ -68,13 +70,14 @@ pub fn singularity(jacobian: &Matrix6<f64>, settings: &RateSettings) -> Option<(
     Some((math::sqrt(eigen.eigenvalues[least].max(0.0)), joint as u8))
 }
 
-/// Joint rates that give the gripper screw `xi` (gripper frame; m/s, rad/s): damped least squares `J^T (J J^T + d² I)^-1 xi`.
+/// Joint rates that give the gripper screw `xi` (gripper frame; m/s, rad/s): damped least squares `J^T (J J^T + d²
+/// I)^-1 xi`.
 ///
-/// The damping grows from zero as the smallest singular value falls below the soft limit (Nakamura and Hanafusa); the whole
-/// motion is slowed on the way to the hard limit.
+/// The damping grows from zero as the smallest singular value falls below the soft limit (Nakamura and Hanafusa, 1986),
+/// and all rates are scaled down towards the hard limit.
 ///
 /// # Errors
-/// [`RateError::Singular`] at the hard limit; [`RateError::NotFinite`].
+/// [`RateError::Singular`] at the hard limit; [`RateError::NotFinite`] for values that are not finite.
 pub fn joint_rates(jacobian: &Matrix6<f64>, xi: &Twist, settings: &RateSettings) -> Result<Rates, RateError> {
     if xi.iter().any(|v| !v.is_finite()) {
         return Err(RateError::NotFinite);
@@ -112,7 +115,7 @@ mod tests {
     const XI: Twist = Twist::new(0.05, -0.02, 0.1, 0.1, 0.2, -0.1);
 
     #[test]
-    fn rates_give_the_asked_screw_where_the_arm_can() {
+    fn rates_give_the_requested_screw_away_from_singularities() {
         let mount = Pose::translation(0.0, 0.0, 0.15);
         for model in Model::ALL {
             let j = Dh::nominal(model).body_jacobian(&READY, &mount);
@@ -122,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn names_the_straight_elbow_and_the_straight_wrist() {
+    fn straight_elbow_and_straight_wrist_are_named() {
         let dh = Dh::nominal(Model::Ur5e);
         let mut q = READY;
         q[4] = 1e-4;
@@ -135,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn slows_smoothly_into_a_singularity_and_never_races() {
+    fn rates_stay_bounded_towards_a_singularity() {
         let dh = Dh::nominal(Model::Ur5e);
         let s = RateSettings::default();
         let (mut seen_slow, mut last) = (false, 1.0);
@@ -147,7 +150,7 @@ mod tests {
                     assert!(r.scale <= last + 1e-9, "scale falls towards the singularity");
                     last = r.scale;
                     seen_slow |= r.scale < 0.5;
-                    // Undamped, the rates would pass |xi| / sigma; slowed they stay below |xi| / soft.
+                    // Undamped, the rates would exceed |xi| / sigma; scaled down they stay below |xi| / soft.
                     assert!(r.rates.iter().all(|v| v.abs() < 1.2 * XI.norm() / s.soft_sigma));
                 }
                 Err(e) => {

@@ -1,8 +1,9 @@
-//! What the marks say about the rig's own error, beside the gripper's pose.
+//! Estimates the error of the rig together with the gripper's pose.
 //!
-//! The pose is fitted to both views with the rig as its file has it. What remains in the images is noise and the rig's error seen
-//! through the pose that was fitted to it. [`Evidence`] holds the normal equations of both, pose first, so that the pose can be
-//! eliminated (what no motion of the gripper explains) or held by a prediction of its own (see [`super::rig_watch`]).
+//! The pose is fitted to both views with the rig of the file. The residuals are noise and the effect of the rig's error
+//! that the fitted pose has not absorbed. [`Evidence`] holds the normal equations of both, pose first, so that the pose
+//! can be eliminated (what no motion of the gripper explains) or constrained by a prediction (see
+//! [`super::rig_watch`]).
 
 use super::pose::{self, MarkTable, PoseEstimate, PoseSettings};
 use crate::geom::{Pose, RIG_UNKNOWNS, Rig, RigError, RigOffset, View};
@@ -20,7 +21,7 @@ pub type JointVector = SMatrix<f64, UNKNOWNS, 1>;
 /// Symmetric matrix over the rig's unknowns.
 pub type RigMatrix = SMatrix<f64, RIG_UNKNOWNS, RIG_UNKNOWNS>;
 
-/// Whitened error above which a mark has less of a say.
+/// Whitened error above which a mark is weighted down (Huber), standard deviations.
 const HUBER: f64 = 2.5;
 
 /// Normal equations of one pair of images at one pose.
@@ -28,22 +29,22 @@ const HUBER: f64 = 2.5;
 pub struct Evidence {
     /// Information about pose and rig.
     pub information: Joint,
-    /// Its right-hand side: what the errors say about a change of either.
+    /// Right-hand side of the normal equations.
     pub score: JointVector,
     /// Weighted sum of squared errors.
     pub squares: f64,
     /// Sum of the observations' mean weights, 1/px².
     pub weight: f64,
-    /// Sum of the marks' own mean variances, px².
+    /// Sum of the marks' mean variances, px².
     pub variance_px2: f64,
-    /// Observations: a mark in one view is one.
+    /// Number of observations: a mark in one view is one.
     pub points: usize,
 }
 
 impl Evidence {
-    /// Gathers the marks of `table`. To each mark's covariance `floor_px` squared is added: what marks are off by for reasons that
-    /// do not average out. With a change of the unknowns that is held to `explain` the marks, those that it does not explain have
-    /// less of a say. `None` when a mark falls behind a camera or a number is not finite.
+    /// Accumulates the marks of `table`. The square of `floor_px`, the error of a mark that does not average out, is
+    /// added to each covariance. With `explain`, a change of the unknowns, marks that it does not explain are weighted
+    /// down. `None` if a mark is behind a camera or a value is not finite.
     pub fn gather(
         rig: &Rig,
         gripper: &Gripper,
@@ -100,7 +101,7 @@ impl Evidence {
         (finite && e.points > 0).then_some(e)
     }
 
-    /// Information and score about the rig alone, with the pose left to the marks: what no motion of the gripper explains.
+    /// Information and score of the rig alone, with the pose eliminated: what no motion of the gripper explains.
     pub fn without_pose(&self) -> Option<(RigMatrix, RigOffset)> {
         let a: Matrix6<f64> = self.information.fixed_view::<6, 6>(0, 0).into_owned();
         let cross = self.information.fixed_view::<6, RIG_UNKNOWNS>(0, 6).into_owned();
@@ -111,22 +112,22 @@ impl Evidence {
         Some((rig - cross.tr_mul(&gain), self.score.fixed_rows::<RIG_UNKNOWNS>(6) - gain.tr_mul(&b)))
     }
 
-    /// The rig's most probable offset under its stated error, and the weighted rms of what then remains, pixels.
+    /// The most probable offset of the rig under its stated error, and the weighted rms of the remaining error, pixels.
     pub fn offset(&self, error: &RigError) -> Option<(RigOffset, f64)> {
         let (s, b) = self.without_pose()?;
-        let pose_share = {
+        let explained_by_pose = {
             let a: Matrix6<f64> = self.information.fixed_view::<6, 6>(0, 0).into_owned();
             let g: Vector6<f64> = self.score.fixed_rows::<6>(0).into_owned();
             g.dot(&a.cholesky()?.solve(&g))
         };
         let offset = (s + prior(error)).cholesky()?.solve(&b);
-        // What the offset takes from the squares, without the prior's share.
-        let taken = 2.0 * b.dot(&offset) - offset.dot(&(s * offset));
-        let left = (self.squares - pose_share - taken).max(0.0);
+        // Without the contribution of the prior.
+        let explained_by_offset = 2.0 * b.dot(&offset) - offset.dot(&(s * offset));
+        let left = (self.squares - explained_by_pose - explained_by_offset).max(0.0);
         Some((offset, math::sqrt(left / self.weight)))
     }
 
-    /// How the fitted pose moves with the rig: gripper-frame screw for an offset of the rig that the images follow.
+    /// Change of the fitted pose, as a gripper-frame screw, for an offset of the rig.
     pub fn pose_for(&self, offset: &RigOffset) -> Option<Vector6<f64>> {
         let a: Matrix6<f64> = self.information.fixed_view::<6, 6>(0, 0).into_owned();
         let cross = self.information.fixed_view::<6, RIG_UNKNOWNS>(0, 6).into_owned();
@@ -134,21 +135,22 @@ impl Evidence {
     }
 }
 
-/// Information of the stated error.
+/// Information matrix of the stated error.
 fn prior(error: &RigError) -> RigMatrix {
     RigMatrix::from_diagonal(&error.deviations().map(|d| 1.0 / math::sq(d.max(1e-12))))
 }
 
-/// Pose and rig offset that explain the marks together, the offset held by the rig's stated error.
+/// Pose and rig offset fitted together, the offset constrained by the rig's stated error.
 #[derive(Clone, Copy, Debug)]
 pub struct RigFit {
-    /// The pose in the rig that is off by `offset`.
+    /// The pose in the rig that is displaced by `offset`.
     pub estimate: PoseEstimate,
-    /// The rig's offset, most probable under its stated error.
+    /// The most probable offset of the rig under its stated error.
     pub offset: RigOffset,
 }
 
-/// Fits both; `floor_px` is what a mark may be off by on its own. Three rounds of a robust pose and a linear step of the offset.
+/// Fits pose and rig offset; `floor_px` is the error of a mark that does not average out. Two rounds of a robust pose
+/// and a linear step of the offset, then the final pose.
 pub fn fit(
     rig: &Rig,
     gripper: &Gripper,

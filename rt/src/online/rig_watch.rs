@@ -1,17 +1,18 @@
-//! Notices that a camera was moved: docs/HEALTH.md derives this.
+//! Detects that a camera was moved; docs/HEALTH.md derives the method.
 //!
-//! A Kalman filter holds the gripper's pose in the rig and the rig's own offset. Between two frames the pose moves as
-//! the encoders say, with an uncertainty in proportion to the motion; the offset stays. The rig's unknown error is
-//! thereby learnt as a constant, and what a frame shows beyond it is tested: does a step of the rig explain this
-//! frame better than no step, by more than chance? A second test, blind to the encoders, holds what no pose explains,
-//! over a window of frames, against what it was at the start: it sees steps too small for one frame, drifts, and what
-//! happened while the marks were out of sight. Both tests are one function, the gain in likelihood when the unknowns
-//! are allowed to have changed.
+//! A Kalman filter estimates the gripper's pose in the rig and the offset of the rig. Between two frames the pose moves
+//! by the encoders, with an uncertainty proportional to the motion; the offset is constant. The filter so learns the
+//! unknown error of the rig, and a frame is tested for a change beyond it: does a step of the rig explain this frame
+//! better than no step, by more than chance? A second test does not use the encoders: it compares what no pose
+//! explains, over a window of frames, with its value at the start. It detects steps too small for one frame, drifts,
+//! and changes while the marks were out of sight. Both tests are one function, the gain in likelihood when the unknowns
+//! may have changed.
 //!
-//! A step makes the watch suspicious at once, which stops the arm; what it was is decided at rest, where encoders and
-//! images cannot disagree about a motion: a camera that was moved is still moved then, a disturbance is over.
+//! A step makes the watch suspicious immediately, which stops the arm. Its cause is decided at rest, where encoders and
+//! images cannot disagree about a motion: a camera that was moved is still displaced then, a disturbance is over.
 
 use super::likelihood::{STEP, free_pose, gain, scaled, scaled_score, scaled_vector, set_cross, solve, start};
+pub use super::observation::RigHealth;
 use super::pose::MarkTable;
 use super::rig_fit::{Evidence, Joint, JointVector, RigMatrix};
 use crate::geom::{Pose, RIG_UNKNOWNS, Rig, RigError, RigOffset, Twist, adjoint, exp_twist, log_pose};
@@ -19,28 +20,28 @@ use crate::gripper::Gripper;
 use crate::math;
 use nalgebra::{Matrix6, Vector6};
 
-/// What is expected of marks, arm and cameras, and when a change counts.
+/// Expected errors of marks, arm and cameras, and the limits from which a change counts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RigWatchSettings {
-    /// The rig's stated error.
+    /// The stated error of the rig.
     pub rig_error: RigError,
-    /// What a mark is off by for reasons that do not average out over frames, pixels. Default 0.05.
+    /// Error of a mark that does not average out over frames, pixels. Default 0.05.
     pub mark_px: f64,
-    /// Share of the motion between two frames that encoders and images may disagree by: mounting, arm model, exposure
-    /// times. Default 0.03.
+    /// Disagreement of encoders and images as a fraction of the motion between two frames: mounting, arm model,
+    /// exposure times. Default 0.03.
     pub motion_share: f64,
-    /// The same at rest, metres (a turn by this over 0.1 m). Default 20 um.
+    /// Disagreement at rest, metres (rotation: this over 0.1 m). Default 20 um.
     pub rest_m: f64,
-    /// Chi-squared by which a change has to explain a frame, or the window, better; half of it in the frame that
-    /// confirms. Default 45: of the seven degrees of freedom that marks see of a change, chance gives both once in 3
-    /// * 10^9 frames.
+    /// Chi-squared by which a change must explain a frame or the window better; half of it in the frame that confirms.
+    /// Default 45: with the seven degrees of freedom of a change that marks can show, chance gives both once in 3 *
+    /// 10^9 frames.
     pub significant: f64,
-    /// A significant change that leads the gripper astray by less than this is a warning, metres (unit-scaled).
-    /// Default 0.0005.
+    /// Error of the gripper's pose below which a significant change is only a warning, metres (unit-scaled). Default
+    /// 0.0005.
     pub harmless_m: f64,
-    /// Frames in a row that must show a change to make it suspicious: one alone may be a shock. Default 2.
+    /// Consecutive frames with a change that make it suspicious: a single one may be a shock. Default 2.
     pub confirm: u32,
-    /// Frames in a row, at rest, after which it was a camera that moved. Default 12, 0.2 s.
+    /// Consecutive frames at rest after which a camera has moved. Default 12, which is 0.2 s.
     pub decide: u32,
 }
 
@@ -59,62 +60,45 @@ impl Default for RigWatchSettings {
     }
 }
 
-/// The rig as the marks show it.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct RigHealth {
-    /// How far off the rig seems, in deviations of its stated error (root of the sum of squares over its unknowns).
-    pub offset_sigmas: f64,
-    /// Encoders and images disagree as if a camera had moved; at rest it will be known.
-    pub suspicious: bool,
-    /// How many times a camera was found moved since the start. A plan is good for one such number.
-    pub moves: u32,
-    /// How many smaller changes were noticed, which lead the gripper astray by less than matters.
-    pub shakes: u32,
-    /// How far the last of either leads the gripper astray, metres (unit-scaled).
-    pub astray_m: f64,
-    /// Evidence of a change: of one step in this frame, and of the window against the start, as shares of what is
-    /// significant.
-    pub evidence: [f64; 2],
-}
-
-/// Frames after a start before a step can be told: the offset is being learnt.
+/// Frames after a start in which the offset is learnt and no step can be detected.
 const LEARN_FRAMES: u32 = 6;
-/// Frames after which the offset is what later windows are held against.
+/// Frames after which the offset becomes the base of the window test.
 const BASE_FRAMES: u32 = 20;
-/// Share of the offset's covariance that each frame gives back to the stated error: 0.006 px a frame, so that the
-/// filter never believes to know the offset better than marks can be measured.
+/// Fraction by which the offset's covariance returns to the stated error in each frame: 0.006 px per frame, so that the
+/// filter never claims to know the offset better than marks can be measured.
 const FORGET: f64 = 2e-5;
-/// Fading of the window, frames.
+/// Time constant of the window, frames.
 const WINDOW: f64 = 60.0;
-/// Motion from one frame to the next that is rest, metres (unit-scaled): 6 mm/s at 60 Hz.
-const REST_M: f64 = 1e-4;
-/// Motion since the last trusted frame beyond which the encoders cannot clear a suspicion any more, metres: 3 % of it
-/// are 0.6 mm.
-const UNDECIDED_M: f64 = 0.02;
-/// Motion from one frame to the next that no arm makes: the encoders jumped, and say nothing about the images.
-const ABSURD_M: f64 = 0.1;
-/// Length that makes a turn comparable with a shift, metres.
+/// Largest motion between two frames that is rest, metres (unit-scaled): 6 mm/s at 60 Hz.
+const MAX_REST_M: f64 = 1e-4;
+/// Motion since the last trusted frame beyond which the encoders can no longer clear a suspicion, metres (unit-scaled):
+/// 3 % of it are 0.6 mm.
+const MAX_UNDECIDED_M: f64 = 0.02;
+/// Largest motion of an arm between two frames, metres (unit-scaled): beyond it the encoders have jumped.
+const MAX_MOTION_M: f64 = 0.1;
+/// Length that makes a rotation comparable with a translation, metres.
 const LENGTH: f64 = 0.1;
+
 /// The filter; covariances in units of [`STEP`].
 #[derive(Clone, Copy, Debug)]
 struct State {
-    /// Gripper in the rig that is off by `offset`.
+    /// Gripper pose in the rig that is displaced by `offset`.
     pose: Pose,
-    /// Gripper in the robot's base by the encoders at the same instant, where they are known.
+    /// Gripper pose in the robot's base by the encoders at the same time, if known.
     base_from_gripper: Option<Pose>,
     offset: RigOffset,
     covariance: Joint,
     frames: u32,
 }
 
-/// What later windows are held against.
+/// Offset at the start, with which later windows are compared.
 #[derive(Clone, Copy, Debug)]
 struct Base {
     offset: RigOffset,
     covariance: RigMatrix,
 }
 
-/// Faded sums over the last frames, about the base's offset.
+/// Exponentially weighted sums over the last frames, about the offset of the base.
 #[derive(Clone, Copy, Debug)]
 struct Window {
     information: RigMatrix,
@@ -129,25 +113,26 @@ impl Window {
     }
 }
 
-/// The watch. It outlives a loss of the marks: what changed meanwhile is told by what it learnt before.
+/// The watch. It keeps its state when the marks are lost, and so detects what changed meanwhile.
 #[derive(Clone, Debug)]
 pub struct RigWatch {
     settings: RigWatchSettings,
     state: Option<State>,
     base: Option<Base>,
     window: Window,
-    /// Frames in a row with a significant step, and with a significant window.
+    /// Consecutive frames with a significant step, and with a significant window.
     suspect: [u32; 2],
-    /// Suspicious frames in a row at rest.
+    /// Consecutive suspicious frames at rest.
     resting: u32,
-    /// Gripper in the base at the last frame, and how far the suspected step leads astray.
+    /// Gripper pose in the base at the last frame.
     last_base: Option<Pose>,
+    /// Error of the gripper's pose that the suspected step would cause, metres (unit-scaled).
     astray_m: f64,
     health: RigHealth,
 }
 
 impl RigWatch {
-    /// A watch that knows nothing but the rig's stated error.
+    /// A watch that knows only the stated error of the rig.
     pub fn new(settings: RigWatchSettings) -> Self {
         Self {
             settings,
@@ -162,14 +147,14 @@ impl RigWatch {
         }
     }
 
-    /// What the frames so far say.
+    /// State of the rig by the frames so far.
     pub fn health(&self) -> RigHealth {
         self.health
     }
 
-    /// Takes the marks of one pair, the pose fitted to them in the rig as its file has it, and the gripper in the
-    /// robot's base by the encoders at capture. Bounded work: three passes over at most 64 marks, a handful of
-    /// systems of 15 unknowns.
+    /// Takes the marks of one pair, the pose `fitted` to them in the rig of the file, and the gripper's pose in the
+    /// robot's base by the encoders at capture. Bounded work: three passes over at most 64 marks, a few systems of 15
+    /// unknowns.
     pub fn update(
         &mut self,
         rig: &Rig,
@@ -179,7 +164,7 @@ impl RigWatch {
         base_from_gripper: Option<&Pose>,
     ) -> RigHealth {
         if base_from_gripper.is_none() && self.last_base.is_some() {
-            // Encoders that are silent for a while: what was known stays until they are back.
+            // No encoders for a while: the state is kept until they are back.
             return self.health;
         }
         let moved = match (&self.last_base, base_from_gripper) {
@@ -187,7 +172,7 @@ impl RigWatch {
             _ => 0.0,
         };
         self.last_base = base_from_gripper.copied();
-        if moved > ABSURD_M
+        if moved > MAX_MOTION_M
             && let Some(s) = &mut self.state
         {
             s.pose = *fitted;
@@ -195,7 +180,7 @@ impl RigWatch {
             free_pose(&mut s.covariance);
             self.clear();
         }
-        self.resting = if moved < REST_M { self.resting + u32::from(self.suspect[0] > 0) } else { 0 };
+        self.resting = if moved < MAX_REST_M { self.resting + u32::from(self.suspect[0] > 0) } else { 0 };
         let wide = self.spread();
         let state = match self.state {
             Some(s) => self.predict(s, fitted, base_from_gripper),
@@ -207,7 +192,7 @@ impl RigWatch {
                 frames: 0,
             },
         };
-        // A number that is not one, or marks that fix nothing, leave the watch as it was.
+        // NaN, or marks that determine nothing, leave the state unchanged.
         if self.judge(rig, gripper, table, state, &wide).is_none() {
             self.clear();
         }
@@ -227,10 +212,10 @@ impl RigWatch {
         RigMatrix::from_diagonal(&RigOffset::from_fn(|i, _| math::sq(d[i] / STEP[6 + i])))
     }
 
-    /// The state at this frame: moved by the encoders, or where the marks are if nothing is known of the motion.
+    /// The state predicted for this frame: moved by the encoders, or at the fitted pose if the motion is not known.
     fn predict(&self, mut s: State, fitted: &Pose, base_from_gripper: Option<&Pose>) -> State {
         let wide = self.spread();
-        // The offset's covariance drifts towards the stated error, its cross terms fade alike.
+        // The offset's covariance returns towards the stated error; its cross terms fade accordingly.
         let keep = 1.0 - FORGET;
         let mut rig = s.covariance.fixed_view_mut::<RIG_UNKNOWNS, RIG_UNKNOWNS>(6, 6);
         rig *= keep * keep;
@@ -266,7 +251,7 @@ impl RigWatch {
         let off = rig.offset(&s.offset);
         let narrow = s.covariance;
         let wide = narrow + Joint::identity();
-        // Twice: a mark that not even a step explains is no evidence for one.
+        // Reweighted twice: a mark that not even a step explains is no evidence for one.
         let mut explained = JointVector::zeros();
         let mut evidence = None;
         for pass in 0..3 {
@@ -278,15 +263,15 @@ impl RigWatch {
         let e = evidence?;
         let (information, score) = (scaled(&e.information), scaled_score(&e.score));
         let (chi2, step) = gain(&information, &score, &narrow, &wide)?;
-        let learnt = s.frames >= LEARN_FRAMES;
-        self.health.evidence[0] = if learnt { chi2 / self.settings.significant } else { 0.0 };
-        // A second frame is held to half: it comes after twice the motion, and two by chance are rarer than one.
+        let learned = s.frames >= LEARN_FRAMES;
+        self.health.evidence[0] = if learned { chi2 / self.settings.significant } else { 0.0 };
+        // Half of it is enough in the confirming frame: two chance events are rarer than one.
         let needed = if self.suspect[0] > 0 { 0.5 } else { 1.0 };
         if self.health.evidence[0] >= needed {
             self.suspect[0] += 1;
             self.health.suspicious = self.suspect[0] >= self.settings.confirm;
             if self.health.suspicious {
-                // What the loop would make of it: the pose that the marks alone ask for, against where the gripper is.
+                // The effect on the loop: the pose that the marks alone give, relative to the gripper's pose.
                 let step = scaled_vector(&step);
                 let rig_part: RigOffset = step.fixed_rows::<RIG_UNKNOWNS>(6).into_owned();
                 let pose_part: Twist = step.fixed_rows::<6>(0).into_owned();
@@ -295,7 +280,7 @@ impl RigWatch {
                     self.changed(self.astray_m, State { covariance: wide, ..s });
                 }
             }
-            // A frame that may be of a moved camera teaches nothing.
+            // A frame that a moved camera may have taken is not learnt from.
             return Some(());
         }
         if self.health.suspicious {
@@ -304,7 +289,7 @@ impl RigWatch {
                 (Some(then), Some(now)) => size(&log_pose(&(then.inverse() * now))),
                 _ => 0.0,
             };
-            if since > UNDECIDED_M {
+            if since > MAX_UNDECIDED_M {
                 self.changed(self.astray_m, State { covariance: wide, ..s });
                 return Some(());
             }
@@ -323,7 +308,7 @@ impl RigWatch {
         Some(())
     }
 
-    /// Holds what no pose explains, over the window, against the base.
+    /// Compares what no pose explains, over the window, with the base.
     fn against_base(&mut self, base: &Base, e: &Evidence, s: &State, spread: &RigMatrix) -> Option<()> {
         let (information, score) = e.without_pose()?;
         let score = score + information * (s.offset - base.offset);
@@ -333,13 +318,13 @@ impl RigWatch {
         w.score = w.score * keep + score;
         w.variance_px2 = w.variance_px2 * keep + e.variance_px2 / e.points as f64;
         w.weight = w.weight * keep + 1.0;
-        // Averaging takes the marks' noise down, not what does not average out.
+        // Averaging reduces the marks' noise, but not the error that does not average out.
         let (own, rest) = (w.variance_px2 / w.weight, math::sq(self.settings.mark_px));
         let frames = (own + rest) / (own / w.weight + rest);
         let units = RigOffset::from_fn(|i, _| STEP[6 + i]);
         let information = RigMatrix::from_fn(|i, j| w.information[(i, j)] * units[i] * units[j]) * (frames / w.weight);
         let score = w.score.component_mul(&units) * (frames / w.weight);
-        // What the base may be wrong by, and what its directions that were not seen then may turn out to be.
+        // The uncertainty of the base, with some for directions that were not observable then.
         let narrow = base.covariance + spread * 1e-4;
         let (chi2, change) = gain(&information, &score, &narrow, &(narrow + RigMatrix::identity()))?;
         self.health.evidence[1] = chi2 / self.settings.significant;
@@ -361,12 +346,12 @@ impl RigWatch {
         Some(())
     }
 
-    /// Notes a change, and learns anew what may have changed.
+    /// Notes a change, and starts to learn again what may have changed.
     fn changed(&mut self, astray_m: f64, mut state: State) {
         self.clear();
         self.health.astray_m = astray_m;
         if astray_m <= self.settings.harmless_m {
-            // Small, and the base stays: many small changes add up against it.
+            // A small change keeps the base, so that many small changes add up against it.
             self.health.shakes += 1;
             self.state = Some(state);
             return;
@@ -380,7 +365,7 @@ impl RigWatch {
     }
 }
 
-/// The filter's step.
+/// The measurement update of the filter.
 fn learn(mut s: State, information: &Joint, score: &JointVector) -> Option<State> {
     // P' = P (I + S P)^-1, from its transpose (I + P S)^-1 P.
     let p = solve(Joint::identity() + s.covariance * information, s.covariance)?;

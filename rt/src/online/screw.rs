@@ -1,7 +1,8 @@
-//! The law: from mark errors in the images to the gripper's correction and velocity screw.
+//! The control law: from the marks' errors in the images to the correction of the gripper's pose (paper section 5).
 //!
-//! All marks of the views in use are stacked: four rows a mark in stereo, two in one view. The stack is never stored; each mark
-//! adds its part to the weighted normal equations, so that 32 marks in two views cost 64 small products and one 6x6 solve.
+//! The interaction matrices of all marks in the views in use are stacked: four rows per mark in stereo, two in one
+//! view. The stack is not stored: each mark is added to the weighted normal equations, so that 32 marks in two views
+//! cost 64 small products and one 6x6 solve.
 
 use super::interaction::PlacedView;
 use crate::geom::{Pixel, Twist, Vec3, View};
@@ -11,19 +12,19 @@ use nalgebra::{Matrix2, Matrix6, SymmetricEigen, Vector6};
 /// Which images close the loop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub enum ViewMode {
-    /// Both, stacked: cancels calibration errors in depth as well.
+    /// Both, stacked: observes depth, so that errors of the calibration cancel in depth as well.
     #[default]
     Stereo,
     /// The left image only.
     Left,
     /// The right image only.
     Right,
-    /// The paper's mode: the one image that the plan found to show the marks best.
+    /// The paper's mode: the view that shows the marks best according to the plan.
     Best,
 }
 
 impl ViewMode {
-    /// Whether `view` takes part, given the plan's better view.
+    /// Whether `view` is used, given the plan's best view.
     pub fn uses(self, view: View, best: View) -> bool {
         match self {
             ViewMode::Stereo => true,
@@ -34,14 +35,14 @@ impl ViewMode {
     }
 }
 
-/// Where the image Jacobian is taken.
+/// The pose at which the interaction matrix is evaluated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub enum JacobianAt {
-    /// At the present pose: straight paths.
+    /// The current pose: straight paths in the image.
     Current,
-    /// At the reference pose: constant near the end.
+    /// The reference pose: constant near the goal.
     SetPoint,
-    /// The mean of both: second order in the error.
+    /// The mean of both: its error is of second order (Malis, 2004).
     #[default]
     Mean,
 }
@@ -51,25 +52,28 @@ pub enum JacobianAt {
 pub struct LawSettings {
     /// Images in use. Default: stereo.
     pub views: ViewMode,
-    /// Where the Jacobian is taken. Default: mean.
+    /// Evaluation of the interaction matrix. Default: mean.
     pub jacobian: JacobianAt,
-    /// Gain close to the reference, 1/s. Default 2.5; above about 5 the loop rings on a 30 ms camera delay with a poor arm model.
+    /// Gain close to the reference, 1/s. Default 2.5; above about 5 the loop oscillates with a camera delay of 30 ms
+    /// and a poor arm model.
     pub gain_near_per_s: f64,
-    /// Gain far from it, 1/s. Default 1.0.
+    /// Gain far from the reference, 1/s. Default 1.0.
     pub gain_far_per_s: f64,
     /// Correction (unit-scaled length) at which the gain is halfway between, metres. Default 0.02.
     pub gain_knee_m: f64,
-    /// Length that makes a turn comparable with a shift: 1 rad counts as this many metres. Default 0.1, a gripper's size.
+    /// Length that makes a rotation comparable with a translation: 1 rad counts as this many metres. Default 0.1, the
+    /// size of a gripper.
     pub length_m: f64,
-    /// Damping of the least squares as a singular value, pixels (rms) per metre. Default 2, far below a healthy stack's 30 to 800.
+    /// Damping of the least squares as a singular value, pixels (rms) per metre. Default 2; usual stacks have 30 to
+    /// 800.
     pub damping_px_per_m: f64,
-    /// Lowest singular value that is still acted upon, pixels (rms) per metre. Default 6.
+    /// Smallest singular value with which the arm may move, pixels (rms) per metre. Default 6.
     pub min_sigma_px_per_m: f64,
-    /// Highest condition number that is still acted upon. Default 300.
+    /// Largest condition number with which the arm may move. Default 300.
     pub max_condition: f64,
-    /// Fewest image points (a mark in one view is one). Default 4.
+    /// Smallest number of image points (a mark in one view is one). Default 4.
     pub min_points: u8,
-    /// Standard deviation under which no mark is believed to lie, pixels. Default 0.02.
+    /// Lower bound of a mark's standard deviation, pixels. Default 0.02.
     pub floor_sigma_px: f64,
 }
 
@@ -98,7 +102,8 @@ impl LawSettings {
         self.gain_far_per_s + (self.gain_near_per_s - self.gain_far_per_s) * math::exp(-core::f64::consts::LN_2 * x)
     }
 
-    /// Unit-scaled length of a small gripper motion: translation and `length_m` times the turn, metres.
+    /// Unit-scaled length of a small gripper motion, metres: the root of the squares of translation and `length_m`
+    /// times rotation.
     pub fn size(&self, xi: &Twist) -> f64 {
         let l2 = math::sq(self.length_m);
         let (t, r) = (xi.fixed_rows::<3>(0).norm_squared(), xi.fixed_rows::<3>(3).norm_squared());
@@ -106,62 +111,64 @@ impl LawSettings {
     }
 }
 
-/// What the stack of marks says.
+/// Solution of the stack.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Screw {
-    /// Small gripper motion `[m; rad]` in the gripper frame that brings the marks onto the reference, by damped weighted least squares.
+    /// Small gripper motion `[v; ω]` (m, rad) in the gripper frame that brings the marks onto the reference, by damped
+    /// weighted least squares.
     pub correction: Twist,
-    /// Root mean square distance of the marks from the reference, pixels a coordinate.
+    /// Root mean square distance of the marks from the reference, pixels per coordinate.
     pub error_px: f64,
-    /// What of `error_px` no motion can remove: noise and calibration error. At rest this is the rig's health figure.
+    /// Part of `error_px` that no motion can remove, pixels: noise and calibration error. At rest it shows the health
+    /// of the rig.
     pub residual_px: f64,
-    /// Standard deviation of the correction's translation that the marks' covariances predict, metres.
+    /// Standard deviation of the correction's translation by the marks' covariances, metres.
     pub sigma_m: f64,
-    /// The same of its turn, rad.
+    /// Standard deviation of the correction's rotation, rad.
     pub sigma_rad: f64,
     /// Smallest singular value of the unit-scaled stack, pixels (rms) per metre.
     pub sigma_min: f64,
-    /// Largest over smallest singular value.
+    /// Ratio of the largest to the smallest singular value.
     pub condition: f64,
     /// Image points used.
     pub points: u8,
 }
 
-/// Why the stack gives no screw.
+/// Why the stack has no solution.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ScrewError {
-    /// Fewer image points than asked for.
+    /// Fewer image points than required.
     TooFewPoints {
-        /// Points seen and usable.
+        /// Usable points.
         points: u8,
         /// Points needed.
         needed: u8,
     },
-    /// The marks seen do not fix all six components of the motion.
+    /// The marks do not determine all six components of the motion.
     IllConditioned {
         /// Smallest singular value, pixels per metre.
         sigma_min: f64,
         /// Condition number.
         condition: f64,
     },
-    /// Something in the stack is not a finite number.
+    /// A value in the stack is not finite.
     NotFinite,
 }
 
-/// One mark in one view, as the law takes it.
+/// Error of one mark in one view.
 #[derive(Clone, Copy, Debug)]
 pub struct MarkError {
-    /// Where the mark is now, pixels.
+    /// Current pixel of the mark.
     pub now: Pixel,
-    /// Where it should be now, pixels.
+    /// Reference pixel of the mark.
     pub reference: Pixel,
     /// Covariance of `now`, px².
     pub covariance: Matrix2<f64>,
-    /// Extra weight, 0 to 1.
+    /// Additional weight, 0 to 1.
     pub factor: f64,
 }
 
-/// The stack while it is being filled.
+/// Accumulates the normal equations of the stack.
 #[derive(Clone, Copy, Debug)]
 pub struct Stack {
     settings: LawSettings,
@@ -187,8 +194,9 @@ impl Stack {
         }
     }
 
-    /// Adds the mark at `x_gripper` as one view sees it with the gripper at its present pose (`current`) and at the reference
-    /// pose (`reference`). A mark that cannot be projected, or whose numbers are not finite, adds nothing.
+    /// Adds the mark at `x_gripper` (gripper frame, metres) of one view, with the gripper at its current pose
+    /// (`current`) and at the reference pose (`reference`). A mark that cannot be projected, or with values that are
+    /// not finite, adds nothing.
     pub fn add(&mut self, current: &PlacedView, reference: &PlacedView, x_gripper: &Vec3, mark: &MarkError) {
         let l = match self.settings.jacobian {
             JacobianAt::Current => current.interaction(x_gripper).map(|(_, l)| l),
@@ -229,7 +237,8 @@ impl Stack {
         if self.points < s.min_points {
             return Err(ScrewError::TooFewPoints { points: self.points, needed: s.min_points });
         }
-        // Divided by the total weight the matrix is the mean square pixel motion for a unit of unit-scaled motion.
+        // Divided by the total weight, the matrix is the mean square motion of the pixels per unit of unit-scaled
+        // motion.
         let h = self.h / self.weight;
         let g = self.g / self.weight;
         if h.iter().chain(g.iter()).any(|v| !v.is_finite()) {
@@ -255,7 +264,7 @@ impl Stack {
         if correction.iter().any(|v| !v.is_finite()) {
             return Err(ScrewError::NotFinite);
         }
-        // Explained part of the weighted squares: 2 g.x - x.Hx; what is left, per unit of weight, in px².
+        // The solution explains 2 g.x - x.Hx of the weighted squares; the rest, per unit of weight, is in px².
         let explained = 2.0 * g.dot(&x) - x.dot(&(h * x));
         let left = (self.squares / self.weight - explained).max(0.0);
         let rows = 2.0 * f64::from(self.points);
@@ -272,7 +281,7 @@ impl Stack {
     }
 }
 
-/// Inverse of a covariance with a floor; `None` when it is not a covariance.
+/// Inverse of a covariance with the lower bound `floor` (px) added; `None` if it is not positive definite.
 fn information(c: &Matrix2<f64>, floor: f64) -> Option<Matrix2<f64>> {
     let f = math::sq(floor);
     let (a, b, d) = (c[(0, 0)] + f, 0.5 * (c[(0, 1)] + c[(1, 0)]), c[(1, 1)] + f);
@@ -327,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn the_correction_leads_to_the_goal_in_every_view_mode() {
+    fn the_correction_points_to_the_goal_in_every_view_mode() {
         let goal = Pose::translation(0.05, -0.04, 1.5) * exp_twist(&Twist::new(0.0, 0.0, 0.0, 2.6, 0.3, 0.2));
         for views in [ViewMode::Stereo, ViewMode::Left, ViewMode::Right, ViewMode::Best] {
             for jacobian in [JacobianAt::Current, JacobianAt::SetPoint, JacobianAt::Mean] {
@@ -342,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn the_predicted_deviation_is_the_one_that_noise_makes() {
+    fn the_predicted_deviation_agrees_with_drawn_noise() {
         let goal = Pose::translation(0.05, -0.04, 1.5) * exp_twist(&Twist::new(0.0, 0.0, 0.0, 2.6, 0.3, 0.2));
         let cam = camera();
         let view = PlacedView::new(&cam, &goal);
@@ -350,7 +359,7 @@ mod tests {
             LawSettings { views: ViewMode::Left, damping_px_per_m: 0.01, floor_sigma_px: 0.0, ..Default::default() };
         let (mut shift, mut turn, mut predicted) = (0.0, 0.0, (0.0, 0.0));
         let mut state = 1_u64;
-        // Sum of twelve even numbers: near enough to normal, deviation 1.
+        // Sum of twelve uniform numbers: nearly normal, standard deviation 1.
         let mut normal = || {
             (0..12).fold(-6.0, |t, _| {
                 state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
@@ -384,11 +393,14 @@ mod tests {
         assert_eq!(stack(&s, &goal, &goal, &two).solve(), Err(ScrewError::TooFewPoints { points: 2, needed: 4 }));
         let line: [Vec3; 5] = core::array::from_fn(|i| Vec3::new(0.02 * i as f64, 0.0, 0.0));
         let e = stack(&LawSettings::default(), &goal, &goal, &line).solve();
-        assert!(matches!(e, Err(ScrewError::IllConditioned { .. })), "a line of marks leaves its own turn free: {e:?}");
+        assert!(
+            matches!(e, Err(ScrewError::IllConditioned { .. })),
+            "marks on a line leave the rotation about it free: {e:?}"
+        );
     }
 
     #[test]
-    fn numbers_that_are_none_add_nothing() {
+    fn values_that_are_not_finite_add_nothing() {
         let goal = Pose::translation(0.0, 0.0, 1.5);
         let cam = camera();
         let view = PlacedView::new(&cam, &goal);

@@ -1,25 +1,14 @@
-//! What the vision thread tells the command thread about one stereo pair.
+//! The result of tracking one stereo pair, which the vision thread passes to the command thread.
 
-use super::rig_watch::RigHealth;
-use crate::geom::{Pixel, Pose};
+use super::observation::{MarkObservation, RigHealth};
+use crate::geom::Pose;
 use crate::gripper::MAX_MARKS;
-use nalgebra::{Matrix2, Matrix6};
+use nalgebra::Matrix6;
 
-/// One mark seen in one view.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct MarkObservation {
-    /// Image of the disc's centre, pixels with lens distortion; the perspective bias of the disc's centroid is already removed.
-    pub pixel: Pixel,
-    /// Covariance of `pixel`, px².
-    pub covariance: Matrix2<f64>,
-    /// 0 (barely a mark) to 1 (all of the disc seen, good contrast).
-    pub quality: f32,
-}
-
-/// How much a [`Vision`] may be trusted.
+/// Whether a [`Vision`] may be used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum VisionStatus {
-    /// Marks are not found yet, or were lost: an acquisition is needed before anything may move.
+    /// The marks are not found yet, or lost: they must be acquired before anything may move.
     Lost,
     /// Tracking, with fewer marks than are needed for full speed.
     Degraded,
@@ -32,9 +21,9 @@ pub enum VisionStatus {
 pub struct Vision {
     /// Sequence number of the pair, from the publisher.
     pub sequence: u64,
-    /// When each eye's image was taken (mid-exposure), CLOCK_MONOTONIC nanoseconds.
+    /// Middle of the exposure of left and right, CLOCK_MONOTONIC nanoseconds.
     pub capture_ns: [u64; 2],
-    /// Whether this result may be used.
+    /// Whether the result may be used.
     pub status: VisionStatus,
     /// Marks by view and mark index; `None` where a mark was not seen.
     pub marks: [[Option<MarkObservation>; MAX_MARKS]; 2],
@@ -46,8 +35,8 @@ pub struct Vision {
     pub covariance: Matrix6<f64>,
     /// Root mean square of the weighted reprojection error of the used marks, pixels.
     pub residual_px: f64,
-    /// What of that residual the rig's own error does not explain, pixels.
+    /// Part of that residual that the rig's stated error does not explain, pixels.
     pub inner_residual_px: f64,
-    /// The rig as the marks show it.
+    /// State of the rig by the marks.
     pub rig: RigHealth,
 }

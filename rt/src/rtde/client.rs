@@ -1,6 +1,6 @@
 //! The client's half of a session: which message to send next, and what an answer means. No socket, no clock.
 //!
-//! The order is the one that every controller expects: V, v, O, one I for each input recipe, S; data then flows both ways.
+//! The order of messages: V, v, O, one I for each input recipe, S; then data in both directions.
 
 use core::fmt;
 
@@ -10,56 +10,56 @@ use super::message::{ClientMessage, ControllerMessage, ControllerVersion, Kind, 
 use super::recipe::{Answer, Entry, Recipe, RecipeError, answers, join};
 use super::value::FieldType;
 
-/// Input recipes of one session.
+/// Most input recipes of one session.
 pub const MAX_INPUT_RECIPES: usize = 8;
 
-/// Fields of one recipe.
+/// Most fields of one recipe.
 pub const MAX_FIELDS: usize = 64;
 
-/// Bytes of a name list that every controller takes (RTDE manual); longer ones are refused here.
+/// Longest name list that every controller accepts (RTDE manual), bytes.
 pub const MAX_NAME_LIST: usize = 2048;
 
 /// A recipe of at most [`MAX_FIELDS`] fields.
 pub type SessionRecipe = Recipe<MAX_FIELDS>;
 
-/// Why a session cannot go on.
+/// Why a session cannot continue.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ClientError {
     /// A package is malformed.
     Message(MessageError),
-    /// A message does not fit the buffer given.
+    /// A message does not fit the buffer.
     NoRoom(NoRoom),
     /// The controller refuses protocol versions 2 and 1.
     VersionRefused,
-    /// The controller does not know this variable: its software is too old, or it is another kind of controller.
+    /// The controller does not have this variable: its software is too old, or it is of another series.
     NotFound(Field),
     /// Another client holds this input.
     InUse(Field),
-    /// The variable has another type than the protocol states.
+    /// The variable has a type other than that of the protocol.
     WrongType {
         /// The variable.
         field: Field,
-        /// The type that the controller states.
+        /// Type that the controller states.
         found: FieldType,
     },
-    /// The type list has not one known word for each name.
+    /// The type list does not have one known type for each name.
     WrongList(Side),
-    /// Inputs were accepted without an id to write them by.
+    /// Inputs were accepted without a recipe id.
     NoRecipeId,
-    /// An answer that was not asked for.
+    /// An answer without a request.
     Unexpected(Kind),
     /// The controller refuses to start.
     StartRefused,
-    /// A data package for another recipe than ours.
+    /// A data package of an unknown recipe.
     WrongRecipe(u8),
-    /// A data package is not as long as its recipe.
+    /// A data package does not have the length of its recipe.
     DataLength {
-        /// Bytes of the recipe's values.
+        /// Size of the recipe's values, bytes.
         expected: usize,
-        /// Bytes that came.
+        /// Size of the received values, bytes.
         found: usize,
     },
-    /// The recipes asked for cannot be.
+    /// A requested recipe is not possible.
     Recipe(RecipeError),
     /// The names of a recipe are longer than [`MAX_NAME_LIST`].
     NameList,
@@ -72,24 +72,27 @@ impl fmt::Display for ClientError {
             ClientError::NoRoom(e) => e.fmt(f),
             ClientError::VersionRefused => f.write_str("the controller refuses RTDE protocol versions 2 and 1"),
             ClientError::NotFound(field) => {
-                write!(f, "the controller has no variable `{field}` (NOT_FOUND): its software is older than this needs")
+                write!(
+                    f,
+                    "the controller has no variable `{field}` (NOT_FOUND): its software is older than graspd needs, update it"
+                )
             }
             ClientError::InUse(field) => write!(
                 f,
-                "`{field}` is held by another RTDE client (IN_USE), likely {}: end it; if it has just crashed, its hold ends with \
-                 its connection",
+                "`{field}` is held by another RTDE client (IN_USE), likely {}: end that client; after a crash the variable is free \
+                 as soon as its connection ends",
                 likely_owner(*field)
             ),
             ClientError::WrongType { field, found } => {
-                write!(f, "`{field}` is {found} on this controller, {} was expected", field.kind())
+                write!(f, "`{field}` has type {found} on this controller, expected {}", field.kind())
             }
             ClientError::WrongList(side) => {
-                write!(f, "the answer to the {side:?} recipe has not one type for each name")
+                write!(f, "the answer to the {side:?} recipe does not have one type for each name")
             }
-            ClientError::NoRecipeId => f.write_str("the input recipe was answered without an id"),
-            ClientError::Unexpected(kind) => write!(f, "answer {kind:?} came without being asked for"),
-            ClientError::StartRefused => f.write_str("the controller refuses to start sending"),
-            ClientError::WrongRecipe(id) => write!(f, "data package of recipe {id}, which was not set up"),
+            ClientError::NoRecipeId => f.write_str("the answer to the input recipe has no recipe id"),
+            ClientError::Unexpected(kind) => write!(f, "answer {kind:?} without a request"),
+            ClientError::StartRefused => f.write_str("the controller refuses to start sending data"),
+            ClientError::WrongRecipe(id) => write!(f, "data package of recipe {id}, which is not set up"),
             ClientError::DataLength { expected, found } => {
                 write!(f, "data package has {found} bytes of values, its recipe has {expected}")
             }
@@ -102,7 +105,7 @@ impl fmt::Display for ClientError {
 /// Who usually holds an input that is in use.
 fn likely_owner(field: Field) -> &'static str {
     match field.stem() {
-        // Integer and float registers below 24 and bits below 64 are a fieldbus's as soon as one is enabled.
+        // A fieldbus takes integer and float registers below 24 and bits below 64 as soon as it is enabled.
         ("input_int_register_" | "input_double_register_", Some(0..24)) | ("input_bit_register_", Some(0..64)) => {
             "an EtherNet/IP or PROFINET adapter (disable it in the installation), or a program that uses the lower registers"
         }
@@ -128,42 +131,43 @@ impl From<RecipeError> for ClientError {
     }
 }
 
-/// What a package meant to the session.
+/// Meaning of a package for the session.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Event<'a> {
-    /// A step of the handshake is done; ask [`Session::transmit`] for the next message.
+    /// A step of the handshake is done; [`Session::transmit`] has the next message.
     Progress,
-    /// Values of the output recipe, exactly as long as it.
+    /// Values of the output recipe, with exactly its size.
     Data(&'a [u8]),
-    /// The controller says something.
+    /// A text message of the controller.
     Text(Text<'a>),
-    /// The controller stopped sending, as asked.
+    /// The controller stopped sending, as requested.
     Paused,
 }
 
-/// Where the session is.
+/// State of the handshake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Phase {
-    /// Which protocol version.
+    /// Protocol version requested.
     Version(Version),
-    /// Which controller.
+    /// Controller version requested.
     Identity,
-    /// Which outputs.
+    /// Outputs requested.
     Outputs,
-    /// Which inputs: this one of the input recipes.
+    /// Inputs of this recipe announced.
     Inputs(usize),
-    /// Start asked for.
+    /// Start requested.
     Starting,
-    /// Data flows.
+    /// Data is exchanged.
     Running,
-    /// No data wanted.
+    /// Paused.
     Paused,
 }
 
 /// A client session.
 ///
-/// Give it whole packages by [`handle`](Session::handle) and send what [`transmit`](Session::transmit) writes, until
-/// [`phase`](Session::phase) is [`Phase::Running`]. Nothing is sent twice: `transmit` gives `None` while an answer is awaited.
+/// Pass complete packages to [`handle`](Session::handle) and send what [`transmit`](Session::transmit) writes, until
+/// [`phase`](Session::phase) is [`Phase::Running`]. Nothing is sent twice: `transmit` returns `None` while it awaits an
+/// answer.
 #[derive(Clone, Debug)]
 pub struct Session {
     outputs: SessionRecipe,
@@ -177,11 +181,10 @@ pub struct Session {
 }
 
 impl Session {
-    /// A session that will ask for these variables. `frequency_hz` is left to the controller's maximum when `None`, and
-    /// clamped to it when above.
+    /// A session for these variables. `frequency_hz` is the controller's maximum if `None`, and at most that.
     ///
     /// # Errors
-    /// Names that no controller has, or too many of them.
+    /// Unknown names, or too many of them.
     pub fn new(outputs: &[&str], inputs: &[&[&str]], frequency_hz: Option<f64>) -> Result<Session, ClientError> {
         let mut session = Session {
             outputs: Recipe::resolve(Side::Output, outputs)?,
@@ -201,12 +204,12 @@ impl Session {
         Ok(session)
     }
 
-    /// Where it is.
+    /// State of the handshake.
     pub fn phase(&self) -> Phase {
         self.phase
     }
 
-    /// Whether an answer of the handshake is awaited: then [`transmit`](Session::transmit) has nothing to say.
+    /// Whether the session awaits an answer; [`transmit`](Session::transmit) then returns `None`.
     pub fn is_awaiting(&self) -> bool {
         self.awaiting
     }
@@ -216,7 +219,7 @@ impl Session {
         self.version
     }
 
-    /// The controller's software version, once known.
+    /// Software version of the controller, once known.
     pub fn controller(&self) -> Option<ControllerVersion> {
         self.controller
     }
@@ -226,23 +229,27 @@ impl Session {
         &self.outputs
     }
 
-    /// Id and fields of an input recipe; the id is 0 before it was accepted.
+    /// Id and fields of an input recipe; the id is 0 before it is accepted.
     pub fn input(&self, index: usize) -> Option<(u8, &SessionRecipe)> {
         self.inputs.get(index).map(|(id, recipe)| (*id, recipe))
     }
 
-    /// Packages a second that were asked for.
+    /// Requested packages per second.
     pub fn frequency_hz(&self) -> f64 {
         let max = self.controller.map_or(500.0, |v| v.max_frequency_hz());
         match (self.version, self.frequency_hz) {
-            // Version 1 knows no frequency: the controller sends as fast as it steps.
+            // Version 1 has no frequency: the controller sends a package in every step.
             (Version::V1, _) => max,
             (Version::V2, Some(hz)) if hz.is_finite() && hz > 0.0 => hz.min(max),
             (Version::V2, _) => max,
         }
     }
 
-    /// Writes the next message of the handshake; `None` while an answer is awaited or nothing is left to say.
+    /// Writes the next message of the handshake and returns its length; `None` while an answer is awaited or after the
+    /// handshake.
+    ///
+    /// # Errors
+    /// `out` is too small, or a name list too long.
     pub fn transmit(&mut self, out: &mut [u8]) -> Result<Option<usize>, ClientError> {
         if self.awaiting {
             return Ok(None);
@@ -270,7 +277,7 @@ impl Session {
     /// Takes a package from the controller.
     ///
     /// # Errors
-    /// Anything that makes the session useless; the connection should be closed then.
+    /// The session cannot continue; close the connection.
     pub fn handle<'a>(&mut self, package: Package<'a>) -> Result<Event<'a>, ClientError> {
         let message = ControllerMessage::parse(self.version, package)?;
         match message {
@@ -326,7 +333,7 @@ impl Session {
         if i < self.inputs.len() { Phase::Inputs(i) } else { Phase::Starting }
     }
 
-    /// Data may come before the answer to S is read, and after P; both are normal.
+    /// Data may arrive before the answer to S is read, and after P.
     #[inline]
     fn data<'a>(&self, recipe: Option<u8>, values: &'a [u8]) -> Result<Event<'a>, ClientError> {
         if !matches!(self.phase, Phase::Starting | Phase::Running | Phase::Paused) {
@@ -347,8 +354,8 @@ fn name_list<'o>(entries: &[Entry], out: &'o mut [u8]) -> Result<&'o str, Client
     join(entries.iter().map(|e| e.field), out).map_err(|_| ClientError::NameList)
 }
 
-/// One known type of the expected kind for each field, or the first reason why not. Refusals are looked for first, so that
-/// the field is named even where an old controller stops its list there.
+/// Checks that there is one entry of the expected type for each field. The entries are compared before their number, so
+/// that a refused field is named even if an old controller ends its list there.
 fn check_types(side: Side, fields: &[Entry], types: &str) -> Result<(), ClientError> {
     for (entry, answer) in fields.iter().zip(answers(types)) {
         match answer {

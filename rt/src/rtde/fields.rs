@@ -1,14 +1,14 @@
-//! Every variable that a controller knows: 406 outputs and 175 inputs, with their types.
+//! Every variable of the protocol: 406 outputs and 175 inputs, with their types.
 //!
-//! The register families are stated by rule, everything else by name. A [`Field`] is a number into that list, so it is
-//! `Copy`, it compares in one instruction, and [`Field::index`] can index an array of current values.
+//! Register families are listed by rule, all other variables by name. A [`Field`] is an index into that list: it is
+//! `Copy`, compares in one instruction, and [`Field::index`] can index an array of values.
 
 use core::fmt;
 
 use super::value::FieldType;
 use FieldType::{Bool, Double, Int32, Uint8, Uint32, Uint64, Vector3d, Vector6Int32, Vector6d};
 
-/// Which way a variable travels.
+/// Direction of a variable.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Side {
     /// From the controller.
@@ -58,12 +58,12 @@ impl Field {
         (0..n as u16).map(move |index| Field { side, index })
     }
 
-    /// Which way it travels.
+    /// Its direction.
     pub const fn side(self) -> Side {
         self.side
     }
 
-    /// Position in the list of its side, below [`OUTPUT_COUNT`] or [`INPUT_COUNT`].
+    /// Index in the list of its side, below [`OUTPUT_COUNT`] or [`INPUT_COUNT`].
     pub const fn index(self) -> usize {
         self.index as usize
     }
@@ -73,14 +73,15 @@ impl Field {
         self.family().0.kind
     }
 
-    /// Its name without a register's number, and the number: `("input_int_register_", Some(24))`, `("timestamp", None)`.
+    /// Its name without a register's number, and the number: `("input_int_register_", Some(24))`, `("timestamp",
+    /// None)`.
     pub const fn stem(self) -> (&'static str, Option<u16>) {
         let (family, nth) = self.family();
         (family.stem, if family.count == 0 { None } else { Some(family.first + nth) })
     }
 
-    /// The rule that this field comes from, and its place in it. A `Field` is only made with an index inside the list, so
-    /// the walk ends on a match; the first rule stands in where the type system cannot see that.
+    /// The rule of this field, and its index in that rule. A `Field` is only created with an index inside the list, so
+    /// the search ends with a match; the first rule is the fallback that the type system requires.
     const fn family(self) -> (&'static Family, u16) {
         let list = match self.side {
             Side::Output => OUTPUTS,
@@ -109,12 +110,12 @@ impl fmt::Display for Field {
     }
 }
 
-/// One name, or a row of numbered registers.
+/// One name, or a range of numbered registers.
 struct Family {
     stem: &'static str,
     /// Number of the first register.
     first: u16,
-    /// How many registers; zero for a plain name.
+    /// Number of registers; zero for a plain name.
     count: u16,
     kind: FieldType,
 }
@@ -159,7 +160,7 @@ fn find(list: &'static [Family], name: &str) -> Option<u16> {
     None
 }
 
-/// A register's number in the one spelling that the controller uses: digits, no sign, no leading zero.
+/// A register's number in the controller's spelling: digits, no sign, no leading zero.
 fn register_number(digits: &str) -> Option<u16> {
     let plain = digits == "0" || digits.starts_with(|c: char| c.is_ascii_digit() && c != '0');
     if plain { digits.parse().ok() } else { None }
@@ -287,7 +288,7 @@ mod tests {
     use core::fmt::Write;
 
     #[test]
-    fn the_lists_are_complete_and_every_name_finds_itself() {
+    fn the_lists_are_complete_and_names_round_trip() {
         assert_eq!((OUTPUT_COUNT, INPUT_COUNT), (406, 175));
         for side in [Side::Output, Side::Input] {
             for (i, field) in Field::all(side).enumerate() {
@@ -300,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn types_are_those_of_the_manual() {
+    fn types_agree_with_the_manual() {
         for (name, kind) in [
             ("timestamp", Double),
             ("actual_q", Vector6d),
@@ -319,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn near_misses_are_not_found() {
+    fn similar_names_are_not_found() {
         for name in [
             "",
             "Timestamp",

@@ -1,27 +1,27 @@
-//! Framing: `u16 size` (whole package, header included), `u8 type`, body. TCP keeps no borders, so packages are cut by
-//! size, never by read.
+//! Framing: `u16 size` (of the package, header included), `u8 type`, body. TCP preserves no message boundaries, so
+//! packages are cut by their size.
 
 use core::fmt;
 
 /// Bytes of a package's header.
 pub const HEADER: usize = 3;
 
-/// The largest package that the size field can state.
+/// Largest package that the size field can state, bytes.
 pub const MAX_PACKAGE: usize = u16::MAX as usize;
 
-/// One whole package, borrowed from the bytes it came in.
+/// One complete package, borrowed from the receive buffer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Package<'a> {
-    /// Type byte; [`Kind::from_byte`](super::Kind::from_byte) knows the meaning.
+    /// Type byte; see [`Kind::from_byte`](super::Kind::from_byte).
     pub kind: u8,
-    /// Everything behind the header.
+    /// Bytes after the header.
     pub body: &'a [u8],
 }
 
-/// Framing was lost: nothing after this point of the stream can be trusted, so the connection must be closed.
+/// Framing is lost: the rest of the stream cannot be interpreted, so the connection must be closed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FrameError {
-    /// The stated size is smaller than the header itself.
+    /// The stated size is smaller than the header.
     TooShort {
         /// Stated size, bytes.
         size: u16,
@@ -38,9 +38,11 @@ pub enum FrameError {
 impl fmt::Display for FrameError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            FrameError::TooShort { size } => write!(f, "package states {size} bytes, less than its header of {HEADER}"),
+            FrameError::TooShort { size } => {
+                write!(f, "a package states {size} bytes, less than its header of {HEADER}: is this an RTDE port?")
+            }
             FrameError::TooLong { size, capacity } => {
-                write!(f, "package states {size} bytes, the receive buffer holds {capacity}")
+                write!(f, "a package states {size} bytes, the receive buffer holds {capacity}: is this an RTDE port?")
             }
         }
     }
@@ -48,11 +50,11 @@ impl fmt::Display for FrameError {
 
 impl core::error::Error for FrameError {}
 
-/// Cuts a byte stream into packages, in a buffer of the caller's.
+/// Cuts a byte stream into packages, in the caller's buffer.
 ///
-/// Read into [`space`](Framer::space), tell how much came by [`commit`](Framer::commit), then take packages with
-/// [`next`](Framer::next) until it gives `None`. A buffer of [`MAX_PACKAGE`] bytes takes anything that can be stated; a
-/// smaller one refuses what would not fit. Work per call is bounded by the buffer's size.
+/// Receive into [`space`](Framer::space), report the number of bytes by [`commit`](Framer::commit), then take packages
+/// with [`next`](Framer::next) until it returns `None`. A buffer of [`MAX_PACKAGE`] bytes holds every package; a
+/// smaller one refuses packages that do not fit. Work per call is bounded by the size of the buffer.
 ///
 /// ```
 /// use graspd_rt::rtde::Framer;
@@ -72,22 +74,22 @@ pub struct Framer<B> {
 }
 
 impl<B: AsRef<[u8]> + AsMut<[u8]>> Framer<B> {
-    /// Starts on an empty stream.
+    /// A framer at the start of a stream.
     pub fn new(buffer: B) -> Framer<B> {
         Framer { buffer, start: 0, end: 0, lost: None }
     }
 
-    /// Forgets everything: for a new connection.
+    /// Clears the buffer and the error, for a new connection.
     pub fn clear(&mut self) {
         (self.start, self.end, self.lost) = (0, 0, None);
     }
 
-    /// Bytes received but not yet taken as packages.
+    /// Number of received bytes that are not taken as packages yet.
     pub fn pending(&self) -> usize {
         self.end - self.start
     }
 
-    /// Where the next received bytes go. Empty only while a whole package waits to be taken, or after an error.
+    /// Buffer for the next received bytes. Empty only while a complete package waits to be taken, or after an error.
     pub fn space(&mut self) -> &mut [u8] {
         let buffer = self.buffer.as_mut();
         if self.start > 0 {
@@ -97,12 +99,12 @@ impl<B: AsRef<[u8]> + AsMut<[u8]>> Framer<B> {
         &mut buffer[self.end..]
     }
 
-    /// Says that `n` bytes were put at the start of [`space`](Framer::space); more than fits counts as what fits.
+    /// Reports that `n` bytes were written to the start of [`space`](Framer::space); clamped to its length.
     pub fn commit(&mut self, n: usize) {
         self.end = (self.end + n).min(self.buffer.as_ref().len());
     }
 
-    /// Copies in as much of `bytes` as fits, and says how much that was.
+    /// Copies as many of `bytes` as fit, and returns their number.
     pub fn feed(&mut self, bytes: &[u8]) -> usize {
         let space = self.space();
         let n = bytes.len().min(space.len());
@@ -111,10 +113,10 @@ impl<B: AsRef<[u8]> + AsMut<[u8]>> Framer<B> {
         n
     }
 
-    /// The next whole package, or `None` until more bytes came.
+    /// The next complete package; `None` until more bytes arrive.
     ///
     /// # Errors
-    /// When the stated size cannot be right. The framer then repeats the error until [`clear`](Framer::clear).
+    /// The stated size is not possible. The framer repeats the error until [`clear`](Framer::clear).
     #[allow(clippy::should_implement_trait)] // lends from the buffer, which `Iterator` cannot
     pub fn next(&mut self) -> Result<Option<Package<'_>>, FrameError> {
         if let Some(error) = self.lost {

@@ -1,4 +1,4 @@
-//! The messages of both directions, parsed from a [`Package`] and emitted into a caller's buffer.
+//! The messages of both directions: parsed from a [`Package`], emitted into the caller's buffer.
 
 use core::fmt;
 
@@ -10,7 +10,7 @@ pub enum Version {
     /// No recipe id on outputs, no frequency, free-form text messages.
     #[default]
     V1,
-    /// What every controller since 3.4 / 5.0 speaks.
+    /// Supported by every controller since 3.4 / 5.0.
     V2,
 }
 
@@ -23,7 +23,7 @@ impl Version {
         }
     }
 
-    /// The version of this number, if it is one we speak.
+    /// The version of this number; `None` if it is not supported.
     pub const fn from_number(number: u16) -> Option<Version> {
         match number {
             1 => Some(Version::V1),
@@ -68,7 +68,7 @@ impl Kind {
         Kind::Pause,
     ];
 
-    /// The kind that a type byte stands for.
+    /// The kind of a type byte; `None` for an unknown byte.
     pub fn from_byte(byte: u8) -> Option<Kind> {
         Kind::ALL.into_iter().find(|k| *k as u8 == byte)
     }
@@ -79,7 +79,7 @@ impl Kind {
 pub enum MessageError {
     /// No message has this type byte.
     UnknownKind(u8),
-    /// The body is not as long as the message needs.
+    /// The body does not have the length of the message.
     Length {
         /// The message.
         kind: Kind,
@@ -88,7 +88,7 @@ pub enum MessageError {
     },
     /// A list of names or types is not UTF-8.
     NotText(Kind),
-    /// A number has no meaning: a frequency that is not finite.
+    /// A frequency that is not finite.
     NotANumber(Kind),
 }
 
@@ -97,32 +97,32 @@ impl fmt::Display for MessageError {
         match self {
             MessageError::UnknownKind(byte) => write!(f, "unknown package type {byte}"),
             MessageError::Length { kind, found } => {
-                write!(f, "package {:?} ('{}') cannot have a body of {found} bytes", kind, *kind as u8 as char)
+                write!(f, "a package {:?} ('{}') cannot have a body of {found} bytes", kind, *kind as u8 as char)
             }
-            MessageError::NotText(kind) => write!(f, "package {kind:?} holds names that are not UTF-8"),
-            MessageError::NotANumber(kind) => write!(f, "package {kind:?} holds a number that is not finite"),
+            MessageError::NotText(kind) => write!(f, "a package {kind:?} has names that are not UTF-8"),
+            MessageError::NotANumber(kind) => write!(f, "a package {kind:?} has a number that is not finite"),
         }
     }
 }
 
 impl core::error::Error for MessageError {}
 
-/// The message does not fit: into the buffer given, or into what a package can state.
+/// The message does not fit into the buffer, or is longer than a package can be.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NoRoom {
-    /// Bytes that the package needs.
+    /// Size of the package, bytes.
     pub needed: usize,
 }
 
 impl fmt::Display for NoRoom {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "package of {} bytes does not fit", self.needed)
+        write!(f, "a package of {} bytes does not fit", self.needed)
     }
 }
 
 impl core::error::Error for NoRoom {}
 
-/// How bad a text message is.
+/// Severity of a text message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Level {
     /// 0.
@@ -147,14 +147,14 @@ impl Level {
     }
 }
 
-/// A text message. Its bytes are shown, never trusted: bad UTF-8 is replaced when displayed.
+/// A text message. Invalid UTF-8 is replaced when it is displayed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Text<'a> {
-    /// How bad it is.
+    /// Severity.
     pub level: Level,
-    /// What is said.
+    /// The text.
     pub message: &'a [u8],
-    /// Who says it; empty in version 1.
+    /// Its source; empty in version 1.
     pub source: &'a [u8],
 }
 
@@ -172,7 +172,7 @@ impl<'a> Text<'a> {
         Some(Text { level: Level::from_byte(*level), message, source })
     }
 
-    /// Longer strings than the length byte can state are cut.
+    /// Strings longer than the length byte can state are truncated.
     fn emit(&self, version: Version, out: &mut Writer<'_>) {
         if version == Version::V1 {
             out.put(&[self.level as u8]);
@@ -221,7 +221,7 @@ pub struct ControllerVersion {
 }
 
 impl ControllerVersion {
-    /// Packages a second that this series can send: 125 up to CB3, 500 from the e-Series on.
+    /// Packages per second that this series can send: 125 up to CB3, 500 from the e-Series on.
     pub const fn max_frequency_hz(&self) -> f64 {
         if self.major < 5 { 125.0 } else { 500.0 }
     }
@@ -233,48 +233,48 @@ impl fmt::Display for ControllerVersion {
     }
 }
 
-/// What a client sends.
+/// A message from a client.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ClientMessage<'a> {
-    /// V: asks for a protocol version by number.
+    /// V: request a protocol version by number.
     RequestVersion(u16),
-    /// v: asks who the controller is.
+    /// v: request the version of the controller.
     GetControllerVersion,
-    /// M.
+    /// M: text.
     Text(Text<'a>),
     /// U: values of one input recipe.
     Data {
-        /// The recipe's id.
+        /// Id of the recipe.
         recipe: u8,
         /// Its values, packed.
         values: &'a [u8],
     },
-    /// O: outputs wanted.
+    /// O: request outputs.
     SetupOutputs {
-        /// Packages a second; `None` in version 1.
+        /// Packages per second; `None` in version 1.
         frequency_hz: Option<f64>,
-        /// Names joined by commas; read them by [`names`](super::names).
+        /// Names separated by commas; see [`names`](super::names).
         names: &'a str,
     },
-    /// I: inputs that will be written.
+    /// I: announce inputs.
     SetupInputs {
-        /// Names joined by commas.
+        /// Names separated by commas.
         names: &'a str,
     },
-    /// S.
+    /// S: start sending outputs.
     Start,
-    /// P.
+    /// P: pause sending outputs.
     Pause,
 }
 
-/// What a controller sends.
+/// A message from a controller.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ControllerMessage<'a> {
-    /// V: whether the asked version is spoken.
+    /// V: whether the requested version is accepted.
     VersionAccepted(bool),
-    /// v.
+    /// v: version of the controller.
     ControllerVersion(ControllerVersion),
-    /// M.
+    /// M: text.
     Text(Text<'a>),
     /// U: values of the output recipe.
     Data {
@@ -283,18 +283,18 @@ pub enum ControllerMessage<'a> {
         /// Its values, packed.
         values: &'a [u8],
     },
-    /// O: the types of the names asked for.
+    /// O: types of the requested outputs.
     OutputsSetUp {
         /// The recipe's id, 0 if refused; `None` in version 1.
         recipe: Option<u8>,
-        /// Type words joined by commas; read them by [`answers`](super::answers).
+        /// Type names separated by commas; see [`answers`](super::answers).
         types: &'a str,
     },
-    /// I: the types of the names asked for.
+    /// I: types of the announced inputs.
     InputsSetUp {
         /// The recipe's id, 0 if refused.
         recipe: u8,
-        /// Type words joined by commas.
+        /// Type names separated by commas.
         types: &'a str,
     },
     /// S.
@@ -303,7 +303,7 @@ pub enum ControllerMessage<'a> {
     Paused(bool),
 }
 
-/// The kind of a package, or the reason why it has none.
+/// The kind of a package, or an error for an unknown type byte.
 fn kind_of(package: &Package<'_>) -> Result<Kind, MessageError> {
     Kind::from_byte(package.kind).ok_or(MessageError::UnknownKind(package.kind))
 }
@@ -313,7 +313,7 @@ fn text(kind: Kind, bytes: &[u8]) -> Result<&str, MessageError> {
 }
 
 impl<'a> ClientMessage<'a> {
-    /// Parses what a client sent on a connection of this version.
+    /// Parses a client's message on a connection of this version.
     pub fn parse(version: Version, package: Package<'a>) -> Result<ClientMessage<'a>, MessageError> {
         let kind = kind_of(&package)?;
         let body = package.body;
@@ -347,10 +347,10 @@ impl<'a> ClientMessage<'a> {
         }
     }
 
-    /// Writes the whole package into `out` and gives its length.
+    /// Writes the complete package to `out` and returns its length.
     ///
-    /// In version 1 the frequency is left out; in version 2 a missing one is sent as 0, which the controller takes for its
-    /// maximum.
+    /// In version 1 the frequency is left out. In version 2 a missing frequency is sent as 0, which means the
+    /// controller's maximum.
     pub fn emit(&self, version: Version, out: &mut [u8]) -> Result<usize, NoRoom> {
         match *self {
             ClientMessage::RequestVersion(number) => {
@@ -376,7 +376,7 @@ impl<'a> ClientMessage<'a> {
 }
 
 impl<'a> ControllerMessage<'a> {
-    /// Parses what a controller sent on a connection of this version.
+    /// Parses a controller's message on a connection of this version.
     pub fn parse(version: Version, package: Package<'a>) -> Result<ControllerMessage<'a>, MessageError> {
         let kind = kind_of(&package)?;
         let body = package.body;
@@ -416,8 +416,8 @@ impl<'a> ControllerMessage<'a> {
         }
     }
 
-    /// Writes the whole package into `out` and gives its length. Version 1 has no recipe ids on outputs, so they are left
-    /// out; in version 2 a missing one is sent as 0.
+    /// Writes the complete package to `out` and returns its length. Version 1 has no recipe ids of outputs, so they are
+    /// left out; in version 2 a missing id is sent as 0.
     pub fn emit(&self, version: Version, out: &mut [u8]) -> Result<usize, NoRoom> {
         let id = |w: &mut Writer<'_>, recipe: Option<u8>| {
             if version == Version::V2 {
@@ -450,7 +450,7 @@ impl<'a> ControllerMessage<'a> {
     }
 }
 
-/// Writes as long as there is room, and counts on when there is none.
+/// Writes while there is room, and only counts the bytes after that.
 pub(super) struct Writer<'a> {
     out: &'a mut [u8],
     len: usize,
@@ -466,7 +466,7 @@ impl Writer<'_> {
     }
 }
 
-/// Writes a package: the body by `body`, then the header in front of it.
+/// Writes a package: the body by `body`, then its header.
 pub(super) fn package(kind: Kind, out: &mut [u8], body: impl FnOnce(&mut Writer<'_>)) -> Result<usize, NoRoom> {
     let mut writer = Writer { out, len: 0 };
     writer.put(&[0, 0, kind as u8]);

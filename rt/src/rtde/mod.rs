@@ -1,17 +1,17 @@
 //! RTDE, the real-time data exchange of Universal Robots controllers (TCP port 30004), without IO, clock or heap.
 //!
-//! The layers, in the order a reader should learn them:
+//! The layers, in reading order:
 //!
-//! 1. [`Framer`] cuts a byte stream into [`Package`]s, however it was split or merged on the way.
-//! 2. [`ClientMessage`] and [`ControllerMessage`] are the meanings of packages in both directions and both protocol
-//!    [`Version`]s; `parse` borrows, `emit` writes into a caller's buffer.
-//! 3. [`Field`] knows every variable of the protocol by name and type; a [`Recipe`] is an ordered choice of them, and a
-//!    [`Slot`] the resolved place of one value.
-//! 4. [`Session`] is the client's half of the conversation: what to send next, and what an answer means.
-//! 5. [`StateReader`] and [`CommandWriter`] are graspd's own recipes; [`GapMeter`] counts what the controller left out,
-//!    and [`PhaseLock`] lets a cycle follow the controller's.
+//! 1. [`Framer`] cuts a byte stream into [`Package`]s, however TCP split or merged it.
+//! 2. [`ClientMessage`] and [`ControllerMessage`] are the messages of both directions in both protocol [`Version`]s;
+//!    `parse` borrows, `emit` writes to the caller's buffer.
+//! 3. [`Field`] is a variable of the protocol with name and type, a [`Recipe`] an ordered list of fields, and a
+//!    [`FieldSlot`] the resolved offset of one value.
+//! 4. [`Session`] is the client's half of the handshake: what to send next, and what an answer means.
+//! 5. [`StateReader`] and [`CommandWriter`] read and write graspd's recipes, [`GapMeter`] counts packages that the
+//!    controller left out, and [`PhaseLock`] synchronizes the command thread with the controller.
 //!
-//! All numbers are big-endian. A server is written with the same pieces as a client:
+//! All numbers are big-endian. A server uses the same parts as a client:
 //!
 //! ```
 //! use graspd_rt::rtde::*;
@@ -19,7 +19,7 @@
 //! let n = ClientMessage::RequestVersion(2).emit(Version::V1, &mut bytes).unwrap();
 //! assert_eq!(bytes[..n], [0, 5, b'V', 0, 2]);
 //!
-//! // The controller's half reads it and answers.
+//! // The controller reads it and answers.
 //! let mut framer = Framer::new([0u8; 4096]);
 //! framer.feed(&bytes[..n]);
 //! let package = framer.next().unwrap().unwrap();
@@ -44,7 +44,7 @@ pub use message::{
     ClientMessage, ControllerMessage, ControllerVersion, Kind, Level, MessageError, NoRoom, Text, Version,
 };
 pub use phase::PhaseLock;
-pub use recipe::{Answer, Entry, Recipe, RecipeError, Slot, answers, join, names};
+pub use recipe::{Answer, Entry, FieldSlot, Recipe, RecipeError, answers, join, names};
 pub use robot::{
     COMMAND_FIELDS, ClockStep, CommandWriter, GapMeter, NEEDED_FIELDS, SCRIPT_VERSION, STATE_FIELDS, StateReader,
     script_state,

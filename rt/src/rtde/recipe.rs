@@ -1,4 +1,4 @@
-//! Recipes: which variables travel in a data package, in which order, and where each one's bytes are.
+//! Recipes: the variables of a data package, their order, and the offset of each value.
 
 use core::fmt;
 use core::marker::PhantomData;
@@ -8,16 +8,16 @@ use super::frame::{HEADER, MAX_PACKAGE};
 use super::message::NoRoom;
 use super::value::{FieldType, Value, Wire};
 
-/// Splits a comma list into names. A trailing comma (SDU's client writes one) makes no name, and neither does an empty list.
+/// Splits a comma-separated list into names. A trailing comma (ur_rtde writes one) or an empty list adds no name.
 pub fn names(list: &str) -> impl Iterator<Item = &str> + Clone {
     let list = list.strip_suffix(',').unwrap_or(list);
     list.split(',').map(str::trim).take(if list.is_empty() { 0 } else { usize::MAX })
 }
 
-/// One word of a controller's type list.
+/// One entry of a controller's type list.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Answer {
-    /// The variable exists, and has this type.
+    /// The variable exists and has this type.
     Type(FieldType),
     /// The controller does not know the name.
     NotFound,
@@ -26,7 +26,7 @@ pub enum Answer {
 }
 
 impl Answer {
-    /// From the word on the wire.
+    /// Parses an entry.
     pub fn from_word(word: &str) -> Option<Answer> {
         match word {
             "NOT_FOUND" => Some(Answer::NotFound),
@@ -46,15 +46,15 @@ impl fmt::Display for Answer {
     }
 }
 
-/// Reads a type list word by word; `None` for a word that means nothing.
+/// Iterates over the entries of a type list; `None` for an unknown entry.
 pub fn answers(list: &str) -> impl Iterator<Item = Option<Answer>> + Clone + '_ {
     names(list).map(Answer::from_word)
 }
 
-/// Joins words by commas into `out`: a list of names, or of types.
+/// Joins names or types with commas into `out`.
 ///
 /// # Errors
-/// When `out` is too small; nothing useful is in it then.
+/// `out` is too small; its content is then undefined.
 pub fn join<W: fmt::Display>(words: impl IntoIterator<Item = W>, out: &mut [u8]) -> Result<&str, NoRoom> {
     use fmt::Write;
     struct Sink<'a> {
@@ -74,7 +74,7 @@ pub fn join<W: fmt::Display>(words: impl IntoIterator<Item = W>, out: &mut [u8])
     let mut sink = Sink { out, len: 0 };
     for (i, word) in words.into_iter().enumerate() {
         let comma = if i == 0 { "" } else { "," };
-        // The sink itself never fails; a word's own Display might, and then the list would be wrong.
+        // Writing to the sink cannot fail, but `Display` of a word may.
         if write!(sink, "{comma}{word}").is_err() {
             return Err(NoRoom { needed: usize::MAX });
         }
@@ -84,22 +84,22 @@ pub fn join<W: fmt::Display>(words: impl IntoIterator<Item = W>, out: &mut [u8])
     out.get(..needed).and_then(|b| core::str::from_utf8(b).ok()).ok_or(NoRoom { needed })
 }
 
-/// Why names do not make a recipe.
+/// Why names do not form a recipe.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RecipeError {
-    /// The name at this place of the list (counted from 0) is no variable of that side.
+    /// A name is not a variable of that side.
     Unknown {
-        /// Place in the list.
+        /// Index of the name in the list.
         place: usize,
     },
     /// More fields than the recipe can hold.
     TooMany {
-        /// How many it can hold.
+        /// Number of fields that it can hold.
         capacity: usize,
     },
     /// The values would not fit into one package.
     TooLong {
-        /// Bytes of the values.
+        /// Size of the values, bytes.
         bytes: usize,
     },
 }
@@ -107,28 +107,30 @@ pub enum RecipeError {
 impl fmt::Display for RecipeError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            RecipeError::Unknown { place } => write!(f, "name {} of the recipe is not a variable of RTDE", place + 1),
-            RecipeError::TooMany { capacity } => write!(f, "recipe has more than {capacity} fields"),
-            RecipeError::TooLong { bytes } => write!(f, "recipe needs {bytes} bytes, more than one package holds"),
+            RecipeError::Unknown { place } => {
+                write!(f, "name {} of the recipe is not an RTDE variable: check its spelling", place + 1)
+            }
+            RecipeError::TooMany { capacity } => write!(f, "the recipe has more than {capacity} fields"),
+            RecipeError::TooLong { bytes } => write!(f, "the recipe needs {bytes} bytes, more than a package can hold"),
         }
     }
 }
 
 impl core::error::Error for RecipeError {}
 
-/// A field and the place of its bytes among the values of a data package.
+/// A field and the offset of its value in a data package.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Entry {
     /// The variable.
     pub field: Field,
-    /// First byte, counted from the start of the values.
+    /// First byte of the value, from the start of the values.
     pub offset: u16,
 }
 
-/// Resolved fields in package order, at most `N`.
+/// Resolved fields in the order of the package, at most `N`.
 ///
-/// Every read and write of a [`Slot`] is checked against the bytes given, so a package that is shorter than the recipe gives
-/// `None`, never a wrong value.
+/// Reads and writes by a [`FieldSlot`] check the length of the bytes: a package shorter than the recipe gives `None`,
+/// never a wrong value.
 ///
 /// ```
 /// use graspd_rt::rtde::{Recipe, Side};
@@ -152,7 +154,10 @@ impl<const N: usize> Recipe<N> {
         Recipe { entries: heapless::Vec::new(), size: 0 }
     }
 
-    /// Resolves a comma list of names.
+    /// Resolves a comma-separated list of names.
+    ///
+    /// # Errors
+    /// [`RecipeError`].
     pub fn parse(side: Side, list: &str) -> Result<Recipe<N>, RecipeError> {
         let mut recipe = Recipe::new();
         for (place, name) in names(list).enumerate() {
@@ -162,6 +167,9 @@ impl<const N: usize> Recipe<N> {
     }
 
     /// Resolves names.
+    ///
+    /// # Errors
+    /// [`RecipeError`].
     pub fn resolve(side: Side, names: &[&str]) -> Result<Recipe<N>, RecipeError> {
         let mut recipe = Recipe::new();
         for (place, name) in names.iter().enumerate() {
@@ -170,7 +178,10 @@ impl<const N: usize> Recipe<N> {
         Ok(recipe)
     }
 
-    /// Adds a field at the end.
+    /// Appends a field.
+    ///
+    /// # Errors
+    /// [`RecipeError::TooMany`] or [`RecipeError::TooLong`].
     pub fn push(&mut self, field: Field) -> Result<(), RecipeError> {
         let bytes = self.size + field.kind().size();
         // One byte of the body is the recipe id.
@@ -188,24 +199,24 @@ impl<const N: usize> Recipe<N> {
         &self.entries
     }
 
-    /// Bytes of the values of one data package.
+    /// Size of the values of one data package, bytes.
     pub fn size(&self) -> usize {
         self.size
     }
 
-    /// Where the variable of this name is; `None` if it is not in the recipe, or is not of type `T`. Of a variable that
-    /// stands in the recipe twice, the first.
-    pub fn slot<T: Wire>(&self, name: &str) -> Option<Slot<T>> {
+    /// The slot of the variable with this name; `None` if it is not in the recipe or not of type `T`. If the variable
+    /// is in the recipe twice, the first one.
+    pub fn slot<T: Wire>(&self, name: &str) -> Option<FieldSlot<T>> {
         let first = self.entries.first()?;
         let field = Field::find(first.field.side(), name)?;
         if field.kind() != T::KIND {
             return None;
         }
         let entry = self.entries.iter().find(|e| e.field == field)?;
-        Some(Slot { offset: entry.offset, kind: PhantomData })
+        Some(FieldSlot { offset: entry.offset, kind: PhantomData })
     }
 
-    /// The values of a package one by one, untyped; stops where the bytes end.
+    /// Iterates over the values of a package as [`Value`]s, up to the end of the bytes.
     pub fn values<'a>(&'a self, bytes: &'a [u8]) -> impl Iterator<Item = (Field, Value)> + 'a {
         self.entries
             .iter()
@@ -213,21 +224,21 @@ impl<const N: usize> Recipe<N> {
     }
 }
 
-/// The place of a value of type `T` among the values of a data package: resolve once, read each cycle.
+/// The offset of a value of type `T` in a data package: resolved once, read in each cycle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Slot<T> {
+pub struct FieldSlot<T> {
     offset: u16,
     kind: PhantomData<T>,
 }
 
-impl<T: Wire> Slot<T> {
-    /// The value; `None` when the bytes end before it.
+impl<T: Wire> FieldSlot<T> {
+    /// Reads the value; `None` if `values` is too short.
     #[inline]
     pub fn read(&self, values: &[u8]) -> Option<T> {
         T::read(values, self.offset as usize)
     }
 
-    /// Puts the value in; `None`, and nothing written, when the bytes end before it.
+    /// Writes the value; `None`, and nothing written, if `values` is too short.
     #[inline]
     pub fn write(&self, values: &mut [u8], value: T) -> Option<()> {
         value.write(values, self.offset as usize)

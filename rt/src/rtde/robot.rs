@@ -1,12 +1,12 @@
-//! The recipes that graspd itself uses: robot state in, set-points for its control script out (docs/RTDE-REGISTERS.md).
+//! graspd's recipes: robot state in, set-points for the control script out (docs/RTDE-REGISTERS.md).
 
 use super::message::{Kind, NoRoom, package};
-use super::recipe::{Recipe, Slot};
+use super::recipe::{FieldSlot, Recipe};
 use super::value::Wire;
 use crate::arm::{ArmCommand, ArmMode, Joints, RobotState, ToolPoint};
 
-/// How many of [`STATE_FIELDS`] every controller has; the others came with later software, and a session does without
-/// them.
+/// Number of leading [`STATE_FIELDS`] that every controller has. The others need later software; a session works
+/// without them.
 pub const NEEDED_FIELDS: usize = 17;
 
 /// Output variables of the control session.
@@ -32,8 +32,8 @@ pub const STATE_FIELDS: [&str; 19] = [
     "actual_TCP_speed",
 ];
 
-/// Input variables of the control session: one recipe, written whole with every command, so that no step of the script can
-/// see half of a command.
+/// Input variables of the control session: one recipe, written completely with every command, so that the script never
+/// sees half of a command.
 pub const COMMAND_FIELDS: [&str; 17] = [
     "input_int_register_24",
     "input_int_register_25",
@@ -54,7 +54,7 @@ pub const COMMAND_FIELDS: [&str; 17] = [
     "input_double_register_36",
 ];
 
-/// Version of the control script that this code speaks to.
+/// Version of the control script that this code needs.
 pub const SCRIPT_VERSION: i32 = 1;
 
 /// States of the control script.
@@ -69,28 +69,28 @@ pub mod script_state {
     pub const POSITION: i32 = 4;
     /// Ramps down.
     pub const STOPPING: i32 = 5;
-    /// Refused something and ramped down; idle ends it.
+    /// Fault: ramped down; cleared by idle.
     pub const FAULT: i32 = 7;
     /// Ended.
     pub const ENDED: i32 = 8;
 }
 
-/// Reads a data package as robot state, by places resolved once.
+/// Reads the robot state from a data package, with slots resolved once.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StateReader {
     size: usize,
-    timestamp: Slot<f64>,
-    vectors: [Slot<Joints>; 4],
-    robot_mode: Slot<i32>,
-    words: [Slot<u32>; 3],
-    scales: [Slot<f64>; 2],
-    digital: Slot<u64>,
-    script: [Slot<i32>; 5],
-    tool: Option<[Slot<Joints>; 2]>,
+    timestamp: FieldSlot<f64>,
+    vectors: [FieldSlot<Joints>; 4],
+    robot_mode: FieldSlot<i32>,
+    words: [FieldSlot<u32>; 3],
+    scales: [FieldSlot<f64>; 2],
+    digital: FieldSlot<u64>,
+    script: [FieldSlot<i32>; 5],
+    tool: Option<[FieldSlot<Joints>; 2]>,
 }
 
 impl StateReader {
-    /// Resolves the places; `None` when the recipe lacks one of the first [`NEEDED_FIELDS`] of [`STATE_FIELDS`].
+    /// Resolves the slots; `None` if the recipe lacks one of the first [`NEEDED_FIELDS`] of [`STATE_FIELDS`].
     pub fn new<const N: usize>(recipe: &Recipe<N>) -> Option<StateReader> {
         let s = |n| recipe.slot::<i32>(n);
         Some(StateReader {
@@ -121,13 +121,13 @@ impl StateReader {
         })
     }
 
-    /// Bytes of values in a package.
+    /// Size of the values in a package, bytes.
     pub fn size(&self) -> usize {
         self.size
     }
 
-    /// The robot's state; `None` when the bytes are fewer than the recipe's. Values are as the controller sent them: whoever
-    /// uses them checks that they are finite and plausible.
+    /// Reads the robot state; `None` if `values` is shorter than the recipe. The values are not checked: the command
+    /// cycle checks that they are finite and plausible.
     #[inline]
     pub fn read(&self, values: &[u8], received_ns: u64) -> Option<RobotState> {
         if values.len() < self.size {
@@ -162,7 +162,7 @@ impl StateReader {
         })
     }
 
-    /// Version that the control script reports of itself; 0 where none runs.
+    /// Version that the control script reports; 0 if none runs.
     pub fn script_version(&self, values: &[u8]) -> Option<i32> {
         self.script[4].read(values)
     }
@@ -177,17 +177,17 @@ pub struct CommandWriter {
 }
 
 impl CommandWriter {
-    /// Bytes of one package.
+    /// Size of one package, bytes.
     pub const PACKAGE: usize = 3 + 1 + 4 * 4 + 13 * 8;
 
-    /// For the recipe id that the controller gave to [`COMMAND_FIELDS`], the token of the uploaded script, and the
-    /// acceleration of `speedj` in rad/s2.
+    /// A writer with the controller's recipe id for [`COMMAND_FIELDS`], the token of the uploaded script, and the
+    /// acceleration of `speedj`, rad/s².
     pub fn new(recipe: u8, token: i32, acceleration: f64) -> CommandWriter {
         CommandWriter { recipe, token, acceleration }
     }
 
-    /// Writes one package. With `targets` (rad) a velocity command is sent in position mode. A rate or target that is not
-    /// finite is sent as a stop with zero rates: NaN never leaves this function.
+    /// Writes one package. With `targets` (rad) a velocity command is sent in position mode. A rate or target that is
+    /// not finite is sent as a stop with zero rates, so that NaN is never sent.
     #[inline]
     pub fn write(&self, command: &ArmCommand, targets: Option<&Joints>, out: &mut [u8]) -> Result<usize, NoRoom> {
         let finite = command.rates.iter().chain(targets.into_iter().flatten()).all(|v| v.is_finite());
@@ -213,39 +213,39 @@ impl CommandWriter {
     }
 }
 
-/// How the controller's clock moved from one package to the next.
+/// Step of the controller's clock from one package to the next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ClockStep {
     /// The first package.
     First,
-    /// One period on.
+    /// One period.
     Next,
-    /// This many packages are missing in between: the controller was short of time, or lost them.
+    /// This number of packages is missing in between: the controller skipped them.
     Skipped(u32),
-    /// The clock stood still.
+    /// The clock did not advance.
     Same,
-    /// The clock went back, or is no number: the controller restarted.
+    /// The clock went back or is not finite: the controller restarted.
     Back,
 }
 
-/// Counts gaps by the controller's own clock.
+/// Counts missing packages by the controller's clock.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GapMeter {
     period_s: f64,
     last_s: Option<f64>,
-    /// Packages seen.
+    /// Number of packages received.
     pub packages: u64,
-    /// Packages missing.
+    /// Number of packages missing.
     pub missing: u64,
 }
 
 impl GapMeter {
-    /// For packages that should be `period_s` apart.
+    /// A meter for packages that are `period_s` seconds apart.
     pub fn new(period_s: f64) -> GapMeter {
         GapMeter { period_s, last_s: None, packages: 0, missing: 0 }
     }
 
-    /// Takes a package's time stamp, seconds.
+    /// Takes the time stamp of a package, seconds.
     #[inline]
     pub fn observe(&mut self, timestamp_s: f64) -> ClockStep {
         self.packages = self.packages.saturating_add(1);
@@ -261,7 +261,7 @@ impl GapMeter {
         } else if periods < 2.0 {
             ClockStep::Next
         } else {
-            // A float too large for the integer saturates.
+            // The cast saturates.
             let skipped = (periods - 1.0) as u32;
             self.missing = self.missing.saturating_add(skipped as u64);
             ClockStep::Skipped(skipped)

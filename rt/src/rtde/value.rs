@@ -2,7 +2,7 @@
 
 use core::fmt;
 
-/// Type of one field, as the controller names it in the answer to a recipe.
+/// Type of a field, as the controller names it in the answer to a recipe.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum FieldType {
     /// One byte, zero is false.
@@ -53,7 +53,7 @@ impl FieldType {
         }
     }
 
-    /// The word that stands for this type in a type list.
+    /// Name of this type in a type list.
     pub const fn name(self) -> &'static str {
         match self {
             FieldType::Bool => "BOOL",
@@ -69,7 +69,7 @@ impl FieldType {
         }
     }
 
-    /// The type that a word of a type list stands for.
+    /// The type with this name in a type list.
     pub fn from_name(word: &str) -> Option<FieldType> {
         FieldType::ALL.into_iter().find(|t| t.name() == word)
     }
@@ -139,7 +139,7 @@ impl Value {
         }
     }
 
-    /// Reads a value of type `kind` from the start of `bytes`; `None` when there are too few.
+    /// Reads a value of type `kind` from the start of `bytes`; `None` if there are too few.
     pub fn decode(kind: FieldType, bytes: &[u8]) -> Option<Value> {
         Some(match kind {
             FieldType::Bool => Value::Bool(bool::read(bytes, 0)?),
@@ -155,8 +155,7 @@ impl Value {
         })
     }
 
-    /// Writes the value to the start of `out` and says how many bytes it took; `None`, and nothing written, when there is
-    /// too little room.
+    /// Writes the value to the start of `out` and returns its size; `None`, and nothing written, if `out` is too short.
     pub fn encode(&self, out: &mut [u8]) -> Option<usize> {
         match self {
             Value::Bool(v) => v.write(out, 0)?,
@@ -178,7 +177,7 @@ mod sealed {
     pub trait Sealed {}
 }
 
-/// A Rust type that stands for one RTDE type: what a typed [`Slot`](super::Slot) reads and writes.
+/// A Rust type for one RTDE type, which a typed [`FieldSlot`](super::FieldSlot) reads and writes.
 pub trait Wire: Copy + sealed::Sealed {
     /// The RTDE type.
     const KIND: FieldType;

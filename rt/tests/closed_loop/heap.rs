@@ -1,4 +1,5 @@
-//! Counts this thread's use of the heap: the core cannot allocate by construction, and this shows it on every cycle of every test.
+//! Counts the allocations of this thread: the core cannot allocate by construction, and every cycle of every test
+//! confirms it.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -7,7 +8,7 @@ thread_local! {
     static CALLS: Cell<u64> = const { Cell::new(0) };
 }
 
-/// Calls of the allocator by this thread so far.
+/// Number of allocator calls by this thread.
 pub(crate) fn calls() -> u64 {
     CALLS.get()
 }
@@ -36,7 +37,7 @@ unsafe impl GlobalAlloc for Counting {
 static ALLOCATOR: Counting = Counting;
 
 #[test]
-fn the_count_counts() {
+fn allocations_are_counted() {
     let before = calls();
     drop(std::hint::black_box(vec![1u8; 32]));
     assert_eq!(calls() - before, 2);

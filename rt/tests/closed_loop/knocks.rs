@@ -1,4 +1,4 @@
-//! Cameras that are knocked, and those that are not: nothing may be grasped beside the part, nothing may cry wolf.
+//! Cameras that are moved, and cameras that are not: no grasp next to the part, and no false alarm.
 
 use super::world::{MS, World};
 use graspd_rt::cycle::{CycleSettings, RequestKind};
@@ -6,24 +6,24 @@ use graspd_rt::geom::{Twist, Vec3, View};
 use graspd_rt::mode::{ModeName, Reject};
 use graspd_rt::online::screw::ViewMode;
 
-/// How a run ended.
+/// Result of a run.
 #[derive(Clone, Copy, Debug)]
 struct End {
-    /// Converged: how far from the part as it stands, mm.
+    /// If converged: distance from the part's true position, mm.
     converged_mm: Option<f64>,
-    /// A warning, a hold or a fault was seen.
+    /// Whether there was a warning, a hold or a fault.
     warned: bool,
     moves: u32,
     shakes: u32,
-    /// The most that either test's evidence came to, as a share of what is significant.
+    /// Largest evidence of either test, as a fraction of the significance limit.
     evidence: [f64; 2],
-    /// Milliseconds from the knock to the first warning.
+    /// Time from the camera's move to the first warning, ms.
     after_ms: Option<u64>,
 }
 
-/// One run of at most 15 s with a knock `wait_ms` after the start (none if `knock` is none).
+/// One run of at most 15 s, in which a camera moves `wait_ms` after the start (if `knock` is given).
 fn run(w: &mut World, tracking: bool, wait_ms: u64, knock: Option<(View, Twist)>) -> End {
-    // The part stays where it is, in the base.
+    // The part does not move in the base.
     let base_from_aim = w.base_from_left * w.aim;
     w.run(500);
     assert_eq!(w.cycle(None, true).setpoint_reply, Some(Ok(())));
@@ -108,7 +108,7 @@ fn clean_runs_raise_no_alarm() {
 }
 
 #[test]
-fn a_knocked_camera_is_noticed_before_it_misleads() {
+fn a_knocked_camera_is_detected_before_a_wrong_grasp() {
     let angles = [0.1, 0.2, 0.3, 0.7, 1.0, 2.0, 3.0];
     let shifts = [1.0, 2.0, 3.0, 5.0, 10.0, 20.0];
     let (mut runs, mut silent, mut beyond, mut converged, mut latest) = (0, 0, 0, 0, 0);
@@ -119,7 +119,8 @@ fn a_knocked_camera_is_noticed_before_it_misleads() {
                 for trial in 0..20 {
                     let mut w = World::new(9000 + runs, |_: &mut CycleSettings| {});
                     w.noise_px = [0.02, 0.05, 0.1][trial % 3];
-                    // Rendered marks of 5 to 30 px have 0.02 px; with five times that noise a single image cannot tell a millimetre.
+                    // Rendered marks of 5 to 30 px have 0.02 px of noise; with five times that, one image cannot
+                    // resolve a millimetre.
                     let unsaid_mm = if w.noise_px < 0.09 { 1.0 } else { 1.5 };
                     if trial % 4 == 0 {
                         w.misplace_rig();
@@ -160,7 +161,7 @@ fn a_knocked_camera_is_noticed_before_it_misleads() {
     assert_eq!((beyond, silent), (0, 0));
 }
 
-/// After a knock the old set-point stays refused, whatever the operator does, until a new one is given.
+/// After a camera moved, the old set-point is refused, whatever the operator does, until there is a new one.
 #[test]
 fn a_plan_from_before_the_knock_is_refused_until_there_is_a_new_one() {
     for (seed, view) in [(1, View::Left), (2, View::Right), (3, View::Left), (6, View::Right)] {
@@ -179,16 +180,16 @@ fn a_plan_from_before_the_knock_is_refused_until_there_is_a_new_one() {
         }
         w.cycle(Some(RequestKind::Disarm), false);
         assert_eq!(w.cycle(Some(RequestKind::Arm), false).reply.unwrap().result, Err(Reject::CameraMoved));
-        // A plan made with the camera where it is now is another matter.
+        // A plan made with the camera at its new pose is accepted.
         assert_eq!(w.cycle(None, true).setpoint_reply, Some(Ok(())));
         assert_eq!(w.cycle(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()), "seed {seed}");
         assert_eq!(w.watch.health().moves, 1, "seed {seed}");
     }
 }
 
-/// One shaken image is no knock, and neither are encoders that jump.
+/// One shaken image and encoders that jump are not a moved camera.
 #[test]
-fn a_shock_and_a_jump_of_the_encoders_are_outlived() {
+fn a_shock_and_a_jump_of_the_encoders_raise_no_alarm() {
     let mut w = World::new(21, |_: &mut CycleSettings| {});
     w.run(800);
     let frames = |w: &mut World, n: u64| w.run(n * 17);
@@ -202,9 +203,9 @@ fn a_shock_and_a_jump_of_the_encoders_are_outlived() {
     assert!(h.moves == 0 && h.shakes == 0 && !h.suspicious, "{h:?}");
 }
 
-/// A view that shows next to nothing for long: held, and said; the paper's one view has to be asked for.
+/// A view that shows too few marks for long holds the arm; the paper's mode with one view must be configured.
 #[test]
-fn stereo_that_became_one_view_is_not_driven() {
+fn stereo_with_one_view_lost_holds_the_arm() {
     let mut w = World::new(33, |_: &mut CycleSettings| {});
     w.start();
     w.run(1000);

@@ -1,4 +1,4 @@
-//! The command cycle in lock step with a simulated arm and rig: does it arrive, and does it always stop?
+//! The command cycle in lock step with a simulated arm and rig: it reaches the goal, and it always stops.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod heap;
@@ -13,7 +13,7 @@ use graspd_rt::mode::{FaultCause, ModeName, Reject};
 use graspd_rt::online::screw::ViewMode;
 use world::{Faults, MS, World};
 
-/// Runs until converged; seconds it took.
+/// Runs until converged; returns the time, seconds.
 fn converge(w: &mut World, limit_s: u64) -> Option<f64> {
     w.start();
     let begin = w.now;
@@ -32,7 +32,7 @@ fn converge(w: &mut World, limit_s: u64) -> Option<f64> {
 }
 
 #[test]
-fn arrives_from_anywhere_with_a_wrong_arm_model() {
+fn converges_from_random_poses_with_an_inaccurate_arm_model() {
     let (mut worst, mut worst_angle, mut slowest) = (0.0_f64, 0.0_f64, 0.0_f64);
     for seed in 0..50 {
         let mut w = World::new(seed, |_| {});
@@ -48,16 +48,16 @@ fn arrives_from_anywhere_with_a_wrong_arm_model() {
     println!("50 seeds: worst {worst:.3} mm, {worst_angle:.3} degrees, slowest {slowest:.2} s");
 }
 
-/// An arm that turns its joints the wrong way, and a mounting that is half a turn off: the probe stops both at once.
+/// The probe stops an arm whose joints turn the wrong way, and a mounting that is half a turn off.
 #[test]
-fn the_wrong_way_is_noticed_by_the_probe() {
+fn the_probe_stops_a_motion_in_the_wrong_direction() {
     for seed in 0..16 {
         for kind in 0..2 {
             let mut w = World::new(seed, |_| {});
             if kind == 0 {
                 w.sense = -1.0;
             } else {
-                // The daemon is told of a mounting that is half a turn about the approach off.
+                // The configured mounting is off by half a turn about the approach.
                 let half = exp_twist(&Twist::new(0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI));
                 let mut config = w.config.clone();
                 config.gripper.flange_from_gripper *= half;
@@ -68,7 +68,7 @@ fn the_wrong_way_is_noticed_by_the_probe() {
             w.cycle(Some(RequestKind::Arm), false);
             let started = w.cycle(Some(RequestKind::Servo), false).reply.unwrap().result;
             if started.is_err() {
-                // A mounting so wrong that the way is out of reach is refused before anything moves.
+                // If the path is out of reach with the wrong mounting, it is refused before anything moves.
                 assert_eq!(kind, 1, "seed {seed}: {started:?}");
                 continue;
             }
@@ -77,7 +77,7 @@ fn the_wrong_way_is_noticed_by_the_probe() {
             for _ in 0..2_000 {
                 let out = w.cycle(None, false);
                 fault = fault.or(w.cycle.mode().fault().copied());
-                // How far from the straight way: a mounting that is wrong across the approach is right along it.
+                // Deviation from the straight path: a mounting that is wrong across the approach is right along it.
                 let way = w.setpoint.pregrasp.left_from_gripper.translation.vector - start.translation.vector;
                 let gone = w.left_from_gripper().translation.vector - start.translation.vector;
                 let along = if kind == 0 { 0.0 } else { (gone.dot(&way) / way.norm_squared()).clamp(0.0, 1.0) };
@@ -89,7 +89,7 @@ fn the_wrong_way_is_noticed_by_the_probe() {
             }
             let arrived = w.cycle.mode().name() == ModeName::Converged;
             if kind == 1 && arrived && w.error_to(&w.setpoint.grasp.left_from_gripper).0 < 1.0 {
-                // The loop was closed over a small error of the mounting, and truly arrived.
+                // The error of the mounting was small enough for the loop, which reached the goal.
                 continue;
             }
             let fault = fault.unwrap_or_else(|| panic!("seed {seed} kind {kind}: not noticed"));
@@ -104,9 +104,10 @@ fn the_wrong_way_is_noticed_by_the_probe() {
     }
 }
 
-/// Every fault at a random instant of the motion: named, at rest within bound, silent until an operator's reset, which moves nothing.
+/// Every fault at a random time of the motion: the right code, rest within its bound, and no motion until and by an
+/// operator's reset.
 #[test]
-fn any_fault_at_any_instant_ends_at_rest() {
+fn any_fault_at_any_time_ends_at_rest() {
     type Set = fn(&mut Faults);
     // Fault, code, milliseconds to the first slower set-point.
     let table: [(Set, &str, u64); 24] = [
@@ -163,7 +164,7 @@ fn any_fault_at_any_instant_ends_at_rest() {
             assert_eq!(found, code);
             assert!(after <= bound_ms * MS, "{code} after {} ms", after / MS);
             assert_eq!(w.sent.last().unwrap().1, [0.0; 6], "{code}: at rest in bound");
-            // The fault goes; nothing moves by itself.
+            // The fault disappears; nothing moves without a request.
             w.faults = Faults::default();
             w.run(400);
             let from = w.sent.len() - 150;
@@ -184,9 +185,9 @@ fn any_fault_at_any_instant_ends_at_rest() {
     }
 }
 
-/// A value that jumps while nobody claims the arm refuses arming while it is fresh, and nothing has to be reset afterwards.
+/// A value that jumps while the arm is not armed prevents arming for a while, and needs no reset.
 #[test]
-fn a_glitch_while_idle_is_outlived() {
+fn an_implausible_state_while_idle_needs_no_reset() {
     let mut w = World::new(9, |_| {});
     w.start();
     w.cycle(Some(RequestKind::Stop), false);
@@ -203,9 +204,9 @@ fn a_glitch_while_idle_is_outlived() {
     assert_eq!(w.cycle(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()));
 }
 
-/// The control script latches a fault of its own until it is told to idle: a reset must lead there, or nothing ever would.
+/// The control script latches its fault until it is commanded to idle, which a reset must do.
 #[test]
-fn a_reset_ends_the_scripts_own_fault() {
+fn a_reset_clears_the_fault_of_the_script() {
     let mut w = World::new(7, |_| {});
     w.start();
     w.run(500);
@@ -214,16 +215,16 @@ fn a_reset_ends_the_scripts_own_fault() {
     assert_eq!(w.cycle.mode().fault().unwrap().cause.code(), "F-ARM-11");
     let out = w.cycle(Some(RequestKind::Reset), false);
     assert_eq!((out.reply.unwrap().result, out.command.mode), (Ok(()), ArmMode::Idle));
-    // Until the script has heard it, nothing can be armed.
+    // Arming is refused until the script has received it.
     assert_eq!(w.cycle(Some(RequestKind::Arm), false).reply.unwrap().result, Err(Reject::RobotNotReady));
     w.faults.script_fault = false;
     w.run(300);
     assert_eq!(w.cycle(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()));
 }
 
-/// An image that stands still while the arm moves, an arm that stands still while it is told to move, one that creeps.
+/// A frozen image while the arm moves, an arm that does not move on command, and one that creeps.
 #[test]
-fn images_and_joints_that_disagree_are_noticed() {
+fn disagreement_of_images_and_joints_is_a_fault() {
     type Set = fn(&mut Faults);
     let table: [(Set, &[&str], u64); 2] =
         [(|f| f.frozen_vision = true, &["F-MRK-02", "F-MRK-01"], 260), (|f| f.stuck_arm = true, &["F-ARM-14"], 1500)];
@@ -231,7 +232,7 @@ fn images_and_joints_that_disagree_are_noticed() {
         for trial in 0..6 {
             let mut w = World::new(300 + trial, |_| {});
             w.start();
-            // Into full speed: before that there is little to tell by.
+            // At full speed: before that the disagreement is small.
             while w.cycle(None, false).record.screw.fixed_rows::<3>(0).norm() < 0.06 {
                 assert!(w.cycle.mode().drives(), "never came to speed");
             }
@@ -254,7 +255,7 @@ fn images_and_joints_that_disagree_are_noticed() {
     assert_eq!(w.cycle.mode().fault().map(|f| f.cause.code()), Some("F-ARM-15"));
 }
 
-/// A stop from any instant: the first slower set-point in the same cycle, rest within the ramp, disarmed.
+/// A stop at any time: the first slower set-point in the same cycle, rest within the ramp, disarmed.
 #[test]
 fn a_stop_request_is_a_bounded_ramp() {
     for seed in 0..20 {
@@ -277,7 +278,8 @@ fn a_stop_request_is_a_bounded_ramp() {
     }
 }
 
-/// Requests in any order with faults that come and go: rates are zero in every mode that does not drive or stop, and within limits.
+/// Requests in any order with intermittent faults: rates are zero in every mode that does not drive or stop, and within
+/// limits.
 #[test]
 fn random_requests_and_faults_never_move_an_arm_that_is_not_servoing() {
     let requests = [
@@ -300,7 +302,7 @@ fn random_requests_and_faults_never_move_an_arm_that_is_not_servoing() {
         let mut moved = false;
         for _ in 0..60 {
             let r = requests[(w.rng.next() % requests.len() as u64) as usize];
-            // Often enough the right order, so that it moves at all.
+            // Often in the right order, so that the arm does move.
             let r = match w.cycle.mode().name() {
                 ModeName::Tracking if w.rng.next().is_multiple_of(2) => RequestKind::Arm,
                 ModeName::Armed if w.rng.next().is_multiple_of(2) => RequestKind::Servo,
@@ -336,9 +338,9 @@ fn random_requests_and_faults_never_move_an_arm_that_is_not_servoing() {
     assert!(moves >= 8, "moved in {moves} of 12 runs: a test in which nothing moves proves nothing");
 }
 
-/// The fingers close on arrival where that is wanted, never on the way, and only when asked where it is not.
+/// The gripper closes on arrival if configured, never earlier; otherwise only on request.
 #[test]
-fn closes_on_arrival_when_that_is_wanted() {
+fn closes_on_arrival_if_configured() {
     for wanted in [true, false] {
         let mut w = World::new(1, |s| {
             s.task.close_outputs = 0x0201_0001;
@@ -378,7 +380,7 @@ fn turns_the_valve_about_its_axis_and_retreats() {
         w.run(5_000);
         let n = w.setpoint.object_normal * angle;
         let turned = exp_twist(&Twist::new(0.0, 0.0, 0.0, n.x, n.y, n.z)).rotation;
-        // The centre is the grasp's own origin here, so the turn is all rotation.
+        // The centre is the origin of the grasp here, so the turn is a pure rotation.
         let goal = Pose::from_parts(grasp.translation, turned * grasp.rotation);
         let (mm, deg) = w.error_to(&goal);
         assert!(mm < 1.0 && deg < 0.5, "seed {seed}: {mm} mm {deg} degrees after the turn");
@@ -393,7 +395,7 @@ fn turns_the_valve_about_its_axis_and_retreats() {
     }
 }
 
-/// Reduced mode lowers the speed within a cycle of the ramp; a slow slider slows the motion and winds nothing up.
+/// Reduced mode lowers the speed within a ramp; a slow slider slows the motion, and nothing accumulates meanwhile.
 #[test]
 fn reduced_mode_and_slider_only_slow_it_down() {
     let mut w = World::new(7, |_| {});
@@ -425,7 +427,7 @@ fn the_same_world_twice_is_the_same_to_the_bit() {
     assert_eq!(run(), run());
 }
 
-/// A goal that the arm cannot reach, a way that leaves the images and a plan without marks are refused before anything moves.
+/// A goal out of reach, a path that leaves the images and a plan without marks are refused before anything moves.
 #[test]
 fn bad_goals_are_refused_with_the_reason() {
     let refused = |change: fn(&mut World)| {
@@ -447,7 +449,7 @@ fn bad_goals_are_refused_with_the_reason() {
     assert_eq!(refused(|w| w.setpoint.pregrasp.left_from_gripper.translation.vector.x += 2.0), Reject::PathLeavesView);
 }
 
-/// A rig that both stages believe wrongly: what closes in both images cancels it, one image alone does not in depth.
+/// A calibration error common to both stages cancels in stereo; with one view it does not cancel in depth.
 #[test]
 fn calibration_error_cancels_in_stereo() {
     let run = |views: ViewMode| {
@@ -473,9 +475,9 @@ fn calibration_error_cancels_in_stereo() {
     run(ViewMode::Best);
 }
 
-/// Late and early cycles: every change of rate stays within the acceleration limit over the time that really passed.
+/// Late and early cycles: every change of rate is within the acceleration limit for the time that really passed.
 #[test]
-fn a_jittering_cycle_breaks_no_limit() {
+fn jittering_cycles_keep_the_limits() {
     for seed in 0..6 {
         let mut w = World::new(700 + seed, |_| {});
         w.faults.jitter = 0.6;
@@ -484,7 +486,7 @@ fn a_jittering_cycle_breaks_no_limit() {
     }
 }
 
-/// Cycles missed too often hold the arm; on a host that promises nothing they are only counted.
+/// Too many missed cycles hold the arm; with best-effort settings they are only counted.
 #[test]
 fn missed_cycles_hold_or_are_counted() {
     let miss = |settings: fn(&mut CycleSettings)| {

@@ -1,12 +1,12 @@
-//! What a loop must know that has just begun: what the gripper holds, and whether the arm's kinematics are the
-//! controller's.
+//! Knowledge that a loop needs immediately after its start: whether the gripper is closed, and whether the configured
+//! kinematics are those of the arm.
 
 use super::converge;
 use super::world::{MS, World};
 use graspd_rt::cycle::{CommandCycle, Grip, RequestKind, Why};
 use graspd_rt::mode::{ModeName, Reject};
 
-/// A converged world whose gripper has been closed, and whose loop has been started afresh.
+/// A converged world with a closed gripper and a restarted loop.
 fn restarted() -> World {
     let mut w = World::new(1, |s| {
         s.task.close_outputs = 0x0201_0001;
@@ -26,7 +26,7 @@ fn ask(w: &mut World, kind: RequestKind) -> Result<(), Reject> {
 }
 
 #[test]
-fn a_restart_remembers_what_the_gripper_holds() {
+fn a_closed_gripper_is_known_after_a_restart() {
     let mut w = restarted();
     let out = w.cycle(None, true);
     assert_eq!((out.record.grip, out.command.outputs), (Grip::Closed, 0), "it only looks");
@@ -40,22 +40,22 @@ fn a_restart_remembers_what_the_gripper_holds() {
 }
 
 #[test]
-fn outputs_that_mean_neither_count_as_closed_and_the_pendant_may_open() {
+fn ambiguous_outputs_count_as_closed_and_the_pendant_may_open() {
     let mut w = restarted();
     w.levels = 0;
     assert_eq!(w.cycle(None, true).record.grip, Grip::Unknown);
     assert_eq!(ask(&mut w, RequestKind::Arm), Ok(()));
     w.run(300);
     assert_eq!(ask(&mut w, RequestKind::Servo), Err(Reject::GripperClosed));
-    // Tool output 1, where the wire has it.
+    // Tool output 1, at its bit on the wire.
     w.levels = 1 << 17;
     w.run(10);
     assert_eq!(ask(&mut w, RequestKind::Servo), Ok(()));
 }
 
-/// A new script acts on the first outputs that it hears: those of the session before must not be among them.
+/// A new script acts on the first outputs that it receives: they must not be those of the last session.
 #[test]
-fn a_new_link_is_not_told_what_the_last_one_was_told() {
+fn a_new_link_does_not_repeat_the_outputs_of_the_last_one() {
     let mut w = World::new(1, |s| {
         s.task.close_outputs = 0x0001_0001;
         s.task.open_outputs = 0x0001_0000;
@@ -66,16 +66,16 @@ fn a_new_link_is_not_told_what_the_last_one_was_told() {
     assert_eq!(w.outputs, 0x0001_0001);
     w.faults.link_down = true;
     w.run(50);
-    // Somebody opens it on the pendant while there is no session.
+    // The gripper is opened on the pendant while there is no session.
     w.levels = 0;
     w.faults.link_down = false;
     let out = w.run(300);
     assert_eq!((out.command.outputs, w.levels, out.record.grip), (0, 0, Grip::Open));
 }
 
-/// The controller's speed of its tool point against ours, on both sides of what is allowed.
+/// The controller's tool speed compared with the computed one, on both sides of the limit.
 #[test]
-fn a_tool_that_is_faster_than_we_think_stops_the_arm() {
+fn a_tool_speed_that_differs_from_the_computed_one_stops_the_arm() {
     for (scale, fault) in [(1.0, false), (0.92, false), (1.08, false), (1.25, true), (0.75, true)] {
         let mut w = World::new(3, |_| {});
         w.tool = Some(scale);
@@ -86,9 +86,9 @@ fn a_tool_that_is_faster_than_we_think_stops_the_arm() {
     }
 }
 
-/// What was not measured is not a number.
+/// Values that were not measured are NaN.
 #[test]
-fn nothing_measured_is_no_zero() {
+fn values_not_measured_are_nan_and_not_zero() {
     let mut w = World::new(2, |_| {});
     w.faults.no_vision = true;
     let r = w.run(100).record;
@@ -102,9 +102,9 @@ fn nothing_measured_is_no_zero() {
     assert!(r.left_from_gripper.is_some() && r.error_px.is_finite() && r.residual_px.is_finite());
 }
 
-/// R11: the controller's states come thin. Both sides of the share that holds, which is noticed within two seconds.
+/// The controller leaves out states: both sides of the limit, which holds the arm within two seconds.
 #[test]
-fn thin_states_hold_the_arm() {
+fn missing_states_hold_the_arm() {
     for (one_of, share, held) in [(1, 0.8, false), (4, 0.8, true), (4, 0.24, false)] {
         let mut w = World::new(4, |s| s.watch.state_share = share);
         w.start();
@@ -132,7 +132,7 @@ fn thin_states_hold_the_arm() {
     }
 }
 
-/// M01: where one mark more would hold the arm it goes at half its speed; with one to spare it does not.
+/// The arm moves at half speed when the loss of one more mark would hold it, and at full speed with one mark to spare.
 #[test]
 fn few_marks_slow_the_arm_down() {
     let top = |min_points: u8| {

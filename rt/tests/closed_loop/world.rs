@@ -1,9 +1,9 @@
-//! A world in lock step: an arm that is not quite the model, a rig placed at random, marks as points.
-#![allow(clippy::unwrap_used)] // a test's own world: a surprise in it has to be loud
+//! A world in lock step with the cycle: an arm that differs from its model, a rig at a random pose, marks as points.
+#![allow(clippy::unwrap_used)] // a test
 
 use graspd_rt::arm::{ArmCommand, ArmMode, Dh, Joints, Model, READY, RobotState, ToolPoint};
 use graspd_rt::cycle::{
-    CommandCycle, CommandInput, CommandOutput, CycleConfig, CycleSettings, LinkStatus, Request, RequestKind,
+    CommandCycle, CommandInput, CommandOutput, CommandRequest, CycleConfig, CycleSettings, LinkStatus, RequestKind,
 };
 use graspd_rt::geom::{Camera, Distortion, Pixel, Pose, Rig, Twist, Vec3, View, exp_twist, log_pose};
 use graspd_rt::gripper::{Gripper, MAX_MARKS, Mark};
@@ -28,11 +28,11 @@ impl Rng {
         z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
         z ^ (z >> 31)
     }
-    /// Even in -m..m.
+    /// Uniform in -m..m.
     pub(crate) fn even(&mut self, m: f64) -> f64 {
         ((self.next() >> 11) as f64 / (1_u64 << 52) as f64 - 1.0) * m
     }
-    /// Normal with deviation `s`.
+    /// Normal with standard deviation `s`.
     pub(crate) fn normal(&mut self, s: f64) -> f64 {
         let mut t = 0.0;
         for _ in 0..12 {
@@ -44,13 +44,13 @@ impl Rng {
 
 pub(crate) const MS: u64 = 1_000_000;
 
-/// What the world does wrong on request.
+/// Faults that the world simulates.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Faults {
     pub(crate) no_vision: bool,
     pub(crate) frozen_vision: bool,
     pub(crate) lost_marks: bool,
-    /// The right view shows nothing.
+    /// The right view shows no marks.
     pub(crate) one_view: bool,
     pub(crate) no_state: bool,
     pub(crate) link_down: bool,
@@ -72,7 +72,7 @@ pub(crate) struct Faults {
     pub(crate) internal: bool,
     pub(crate) old_stamps: bool,
     pub(crate) skewed: bool,
-    /// Cycles come up to this share of a period early or late.
+    /// Cycles are up to this fraction of a period early or late.
     pub(crate) jitter: f64,
     pub(crate) slider_zero: bool,
 }
@@ -89,16 +89,16 @@ pub(crate) struct World {
     pub(crate) base_from_left: Pose,
     pub(crate) q: Joints,
     pub(crate) qd: Joints,
-    /// Multiplies what the arm does with its rates: -1 is an arm wired the wrong way.
+    /// Factor on the arm's rates: -1 is an arm that moves in the opposite direction.
     pub(crate) sense: f64,
     pub(crate) setpoint: SetPoint,
     pub(crate) faults: Faults,
     pub(crate) slider: f64,
     pub(crate) noise_px: f64,
     pub(crate) watch: RigWatch,
-    /// Where the gripper really has to go, in the left camera's frame as it stands at the start.
+    /// True goal of the gripper in the left camera's frame at the start.
     pub(crate) aim: Pose,
-    /// Gripper in the believed rig and in the base at the last image in which the marks were found.
+    /// Gripper in the calibrated rig and in the base at the last image in which the marks were found.
     tracked: Option<(Pose, Pose)>,
     pipeline: VecDeque<(u64, Vision)>,
     next_capture: u64,
@@ -107,18 +107,19 @@ pub(crate) struct World {
     pending: ArmCommand,
     pub(crate) sent: Vec<(u64, Joints)>,
     pub(crate) outputs: u32,
-    /// States that came, and those that the controller left out; of how many one comes.
+    /// Numbers of states received and left out by the controller.
     states: [u32; 2],
+    /// One of so many states is received.
     pub(crate) one_of: u32,
     /// `actual_digital_output_bits`.
     pub(crate) levels: u64,
-    /// The controller tells its tool point's speed, this many times the true one.
+    /// The controller reports this many times the true speed of its tool point.
     pub(crate) tool: Option<f64>,
-    /// Time that each step of the cycle took, ns.
+    /// Duration of each step of the cycle, ns.
     pub(crate) step_ns: Vec<u64>,
 }
 
-/// The script's output numbers at their places on the wire: the tool's lie behind the configurable ones.
+/// The script's output bits at their positions on the wire: those of the tool follow the configurable ones.
 fn wire(word: u64) -> u64 {
     word & 0xff | (word & 0x300) << 8
 }
@@ -143,7 +144,7 @@ impl World {
         let mut rng = Rng(seed.wrapping_mul(77).wrapping_add(5));
         let model = [Model::Ur5e, Model::Ur10e, Model::Ur5, Model::Ur3e][(seed % 4) as usize];
         let dh = Dh::nominal(model);
-        // Half a millimetre and a tenth of a degree on every link.
+        // Errors of half a millimetre and a tenth of a degree on every link.
         let mut small = |m: f64| -> [f64; 6] { std::array::from_fn(|_| rng.even(m)) };
         let angle = 0.1_f64.to_radians();
         let delta = Dh { a: small(5e-4), d: small(5e-4), alpha: small(angle), theta: small(angle) };
@@ -151,7 +152,7 @@ impl World {
         let gripper = gripper();
         let q_goal: Joints = std::array::from_fn(|i| READY[i] + rng.even(0.25));
         let turned = exp_twist(&Twist::new(0.0, 0.0, 0.0, rng.even(0.35), rng.even(0.8), rng.even(0.35)));
-        // The marks' side (y of the gripper) towards the cameras.
+        // The side of the marks (y of the gripper) faces the cameras.
         let facing = exp_twist(&Twist::new(0.0, 0.0, 0.0, -std::f64::consts::FRAC_PI_2, 0.0, 0.0));
         let goal = Pose::translation(0.2 + rng.even(0.05), rng.even(0.05), 1.45 + rng.even(0.1)) * turned * facing;
         let base_from_left = true_dh.base_from_gripper(&q_goal, &gripper.flange_from_gripper) * goal.inverse();
@@ -202,7 +203,7 @@ impl World {
             outputs: 0,
             states: [0; 2],
             one_of: 1,
-            // Begins with an open gripper.
+            // The gripper is open at the start.
             levels: wire(u64::from(open & 0xffff)),
             tool: None,
             step_ns: Vec::new(),
@@ -214,8 +215,8 @@ impl World {
             * self.true_dh.base_from_gripper(&self.q, &self.config.gripper.flange_from_gripper)
     }
 
-    /// Makes the rig that the daemon (and the plan) believes wrong by 0.5 % in focal length and 0.1 degrees in relative rotation,
-    /// while what the cameras see at the goal stays what it is.
+    /// Changes the calibrated rig (of daemon and plan) by 0.5 % in focal length and 0.1 degrees in relative rotation.
+    /// The images at the goal are unchanged.
     pub(crate) fn misplace_rig(&mut self) {
         let goal = self.setpoint.grasp.left_from_gripper;
         let seen = plan(&self.config, goal).marks;
@@ -228,9 +229,9 @@ impl World {
         let axis =
             Vec3::new(self.rng.even(1.0), self.rng.even(1.0), self.rng.even(1.0)).normalize() * 0.1_f64.to_radians();
         rig.right_from_left *= exp_twist(&Twist::new(0.0, 0.0, 0.0, axis.x, axis.y, axis.z));
-        let believed = estimate(&self.config, goal, &seen);
-        let pregrasp = believed * Pose::translation(0.0, 0.0, -0.07);
-        self.setpoint.grasp = Goal { left_from_gripper: believed, marks: seen };
+        let estimated = estimate(&self.config, goal, &seen);
+        let pregrasp = estimated * Pose::translation(0.0, 0.0, -0.07);
+        self.setpoint.grasp = Goal { left_from_gripper: estimated, marks: seen };
         self.setpoint.pregrasp = plan(&self.config, pregrasp);
         self.cycle = CommandCycle::new(self.config.clone()).unwrap();
     }
@@ -247,7 +248,7 @@ impl World {
         }
     }
 
-    /// What the tracker makes of the marks: those near where it expects them, and the pose that it fits robustly.
+    /// A model of the tracker: marks near their expected pixels, and the pose fitted robustly to them.
     fn track(&mut self, v: &mut Vision, truth: &Pose) {
         let mount = self.config.gripper.flange_from_gripper;
         let base_from_gripper = self.config.dh.base_from_gripper(&self.q, &mount);
@@ -349,14 +350,14 @@ impl World {
         };
         let e = Twist::from_fn(|i, _| self.rng.normal(if i < 3 { 1e-4 } else { 4e-4 }));
         self.track(&mut v, &pose);
-        // With the right rig the pose is poorer than what the marks give here: they are not all that a tracker has to cope with.
+        // The pose gets additional noise: a tracker has more errors than those of the marks here.
         if self.true_rig == self.config.rig && v.status != VisionStatus::Lost {
             v.left_from_gripper = pose * exp_twist(&e);
         }
         v
     }
 
-    /// What a controller says of its tool point, at the flange, whose speed is this many times the true one.
+    /// The controller's report of a tool point at the flange, with this many times the true speed.
     fn tool_point(&self, scale: f64) -> ToolPoint {
         let speed = self.true_dh.tool_speed(&self.q, &self.qd, &[0.0; 6]);
         ToolPoint { offset: [0.0; 6], speed: [speed * scale, 0.0, 0.0, 0.0, 0.0, 0.0] }
@@ -401,18 +402,18 @@ impl World {
         let dt = self.period as f64 * 1e-9;
         let late = self.rng.even(self.faults.jitter) * self.period as f64;
         self.now += if self.faults.stall { 30 * MS } else { (self.period as f64 + late) as u64 };
-        // The arm: last cycle's set-point, through a first-order lag.
+        // The arm follows the set-point of the last cycle with a first-order lag.
         let mut target = if self.pending.mode == ArmMode::Velocity { self.pending.rates } else { [0.0; 6] };
         let slider = if self.faults.slider_zero { 0.0 } else { self.slider };
         if self.faults.stuck_arm {
             target = [0.0; 6];
         }
         for (i, target) in target.iter().enumerate() {
-            let mut wish = target * slider * self.sense;
+            let mut rate = target * slider * self.sense;
             if self.faults.drift_arm {
-                wish += 0.03;
+                rate += 0.03;
             }
-            self.qd[i] += (wish - self.qd[i]) * (dt / 0.02).min(1.0);
+            self.qd[i] += (rate - self.qd[i]) * (dt / 0.02).min(1.0);
             self.q[i] += self.qd[i] * dt;
         }
         while self.now >= self.next_capture {
@@ -456,7 +457,7 @@ impl World {
         }
         let cycle = self.pending.heartbeat;
         let state = self.state(cycle);
-        // One state a cycle comes; what lies between two of them counts as left out.
+        // One state per cycle is received; states between two of them count as left out.
         self.states[0] += 1;
         self.states[1] += self.one_of - 1;
         let before = std::time::Instant::now();
@@ -472,7 +473,7 @@ impl World {
                 states_missing: self.states[1],
             },
             vision: vision.as_ref(),
-            request: request.map(|kind| Request { id: 1, kind }),
+            request: request.map(|kind| CommandRequest { id: 1, kind }),
             setpoint: offer.then_some(&self.setpoint),
             internal_fault: self.faults.internal,
         });
@@ -495,7 +496,7 @@ impl World {
         out
     }
 
-    /// Offers the set-point, arms and starts; panics with the reason if refused.
+    /// Loads the set-point, arms and starts; panics with the reason if refused.
     pub(crate) fn start(&mut self) {
         self.run(500);
         assert_eq!(self.cycle(None, true).setpoint_reply, Some(Ok(())));
@@ -503,7 +504,7 @@ impl World {
         assert_eq!(self.cycle(Some(RequestKind::Servo), false).reply.unwrap().result, Ok(()));
     }
 
-    /// The oracle: every set-point ever sent, finite, within speed, acceleration and position limits.
+    /// Checks every set-point sent: finite, within the limits of speed, acceleration and position.
     pub(crate) fn judge_wire(&self) {
         let l = self.cycle.limits();
         let (v, a) = (l.velocity(), l.acceleration());
@@ -518,7 +519,7 @@ impl World {
     }
 }
 
-/// Pose that fits pixels best in the believed rig, from a start close to it.
+/// Pose that fits the pixels best in the calibrated rig, from a start close to it.
 fn estimate(c: &CycleConfig, start: Pose, pixels: &[[Option<Pixel>; MAX_MARKS]; 2]) -> Pose {
     let mut pose = start;
     let law = LawSettings { damping_px_per_m: 0.0, ..Default::default() };

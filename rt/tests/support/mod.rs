@@ -1,7 +1,8 @@
-//! A small exact renderer for tests: discs and quads as a camera integrates them over its pixels, with blur, noise and lighting.
+//! A small exact renderer for tests: discs and quadrilaterals integrated over each pixel, with blur, noise and
+//! lighting.
 //!
-//! Outlines are projected point by point through the lens model and filled with exact area coverage (signed areas, as font
-//! rasterisers do), so that the images have no sampling error that a tracker could be tuned to.
+//! Outlines are projected point by point through the lens model and filled with exact area coverage (signed areas, as
+//! font rasterizers do), so that the images have no sampling error that a tracker could be tuned to.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used)]
 
 use graspd_rt::geom::{Camera, Distortion, Pose, Rig, Vec3, View, exp_twist};
@@ -10,7 +11,7 @@ use graspd_rt::image::ImageView;
 use graspd_rt::online::StereoFrame;
 use nalgebra::{Point3, Vector6};
 
-/// A small generator whose stream is the same everywhere (splitmix64).
+/// A random generator with the same stream on every platform (splitmix64).
 #[derive(Clone)]
 pub struct Random(pub u64);
 
@@ -59,7 +60,7 @@ impl Canvas {
         if w > 4000 || h > 4000 {
             return;
         }
-        // Pixel (0, 0) covers [-0.5, 0.5]; the accumulator works with corners at integers.
+        // Pixel (0, 0) covers [-0.5, 0.5]; the accumulator has its corners at integers.
         let mut acc = vec![0.0_f64; w * h + 2];
         for i in 0..polygon.len() {
             let (a, b) = (polygon[i], polygon[(i + 1) % polygon.len()]);
@@ -88,7 +89,7 @@ impl Canvas {
         }
     }
 
-    /// Gain, offset and a ramp over the image, then noise and rounding to bytes.
+    /// Applies gain, offset and a ramp over the image, then noise and rounding to bytes.
     pub fn expose(&self, camera: &Exposure, random: &mut Random) -> Vec<u8> {
         let table: Vec<f32> = (0..4096).map(|_| (random.normal() * camera.noise) as f32).collect();
         let across: Vec<f32> = (0..self.width)
@@ -102,7 +103,7 @@ impl Canvas {
             let offset = camera.offset as f32 + 0.5;
             for ((o, l), a) in out.iter_mut().zip(light).zip(&across) {
                 k = k.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-                // A float to byte conversion saturates by itself.
+                // The cast saturates.
                 *o = (l * (gain + a) + offset + table[(k >> 52) as usize]) as u8;
             }
         }
@@ -124,7 +125,7 @@ impl Default for Exposure {
     }
 }
 
-/// Adds one edge's signed areas to the accumulator (each row's running sum is the coverage).
+/// Adds the signed areas of one edge to the accumulator (the running sum of a row is the coverage).
 fn line(acc: &mut [f64], w: usize, a: (f64, f64), b: (f64, f64)) {
     if a.1 == b.1 {
         return;
@@ -196,7 +197,7 @@ fn smooth(src: &[f64], w: usize, h: usize, sigma: f64) -> Vec<f64> {
     pass(&pass(src, 1, 0), 0, 1)
 }
 
-/// Pixels of a disc's rim; `None` when it faces away or is behind the camera.
+/// Outline of a disc, pixels; `None` if it faces away or is behind the camera.
 pub fn rim(camera: &Camera, camera_from_gripper: &Pose, mark: &Mark) -> Option<Vec<(f64, f64)>> {
     let c = (camera_from_gripper * Point3::from(mark.position)).coords;
     let n = camera_from_gripper.rotation * mark.normal;
@@ -208,7 +209,7 @@ pub fn rim(camera: &Camera, camera_from_gripper: &Pose, mark: &Mark) -> Option<V
     (0..192)
         .map(|k| {
             let t = std::f64::consts::TAU * f64::from(k) / 192.0;
-            // The polygon's area equals the disc's.
+            // The polygon has the area of the disc.
             let r = mark.radius * (1.0 + (std::f64::consts::PI / 192.0).powi(2) / 3.0);
             camera.project(&(c + (a * t.cos() + b * t.sin()) * r)).map(|p| (p.x, p.y))
         })
@@ -230,7 +231,8 @@ impl Default for Scene {
 }
 
 impl Scene {
-    /// Draws the gripper's marks, each on a square plate 1.6 times its size (light round dark marks, dark round light ones).
+    /// Draws the gripper's marks, each on a square plate 1.6 times its size (light round dark marks, dark round light
+    /// ones).
     pub fn draw(&self, canvas: &mut Canvas, rig: &Rig, view: View, gripper: &Gripper, pose: &Pose, hidden: &[usize]) {
         let camera = rig.camera(view);
         let camera_from_gripper = rig.view_from_left(view) * pose;
@@ -259,7 +261,7 @@ pub fn camera(distorted: bool) -> Camera {
     Camera { width: 1280, height: 1024, fx: 1200.0, fy: 1198.0, cx: 642.0, cy: 509.0, distortion }.validated().unwrap()
 }
 
-/// Two cameras 0.5 m apart, both turned towards a point 1.5 m ahead.
+/// Two cameras 0.5 m apart, both looking at a point 1.5 m ahead.
 pub fn rig(distorted: bool) -> Rig {
     let left = camera(distorted);
     let toe = 2.0 * (0.25_f64 / 1.5).atan();
@@ -270,7 +272,8 @@ pub fn rig(distorted: bool) -> Rig {
     Rig { left, right: Camera { fx: 1207.0, cx: 633.0, ..left }, right_from_left: left_from_right.inverse() }
 }
 
-/// Sixteen marks of 11 mm radius (about 9 px at 1.5 m) without symmetry, on a bent front, normals fanned by up to 25 degrees.
+/// Sixteen marks of 11 mm radius (about 9 px at 1.5 m) without symmetry, on a curved front, with normals spread by up
+/// to 25 degrees.
 pub fn gripper() -> Gripper {
     let mut marks = heapless::Vec::new();
     let spots = [
@@ -300,7 +303,7 @@ pub fn gripper() -> Gripper {
     Gripper { marks, flange_from_gripper: Pose::identity() }
 }
 
-/// A pose about 1.5 m before the left camera, the marks towards the cameras, tilted by up to `tilt` radians.
+/// A pose about 1.5 m in front of the left camera, the marks facing the cameras, tilted by up to `tilt` radians.
 pub fn pose(random: &mut Random, tilt: f64) -> Pose {
     let t = Vec3::new(0.25 + random.range(-0.15, 0.15), random.range(-0.18, 0.18), 1.5 + random.range(-0.15, 0.15));
     let spin = exp_twist(&Vector6::new(0.0, 0.0, 0.0, 0.0, 0.0, random.range(-3.1, 3.1)));
@@ -309,7 +312,7 @@ pub fn pose(random: &mut Random, tilt: f64) -> Pose {
     Pose::from_parts(t.into(), tip.rotation * spin.rotation)
 }
 
-/// A pose as [`pose`] gives, moved along the line of sight to another distance.
+/// A pose as of [`pose`], moved along the line of sight to the distance `z`.
 pub fn pose_at(random: &mut Random, tilt: f64, z: f64) -> Pose {
     let mut p = pose(random, tilt);
     let t = &mut p.translation.vector;

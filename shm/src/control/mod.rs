@@ -1,4 +1,4 @@
-//! Telemetry out of the daemon and requests into it (shm/CONTROL.md is the page for outsiders).
+//! Telemetry out of the daemon and requests into it (`CONTROL.md` has the same for other languages).
 
 mod request;
 mod sample;

@@ -1,4 +1,4 @@
-//! Requests to the daemon and its answers: a verb in a fixed header, text as payload.
+//! Requests to the daemon and its answers: a verb in a fixed header, and text as payload.
 
 use iceoryx2::prelude::ZeroCopySend;
 
@@ -6,12 +6,12 @@ use iceoryx2::prelude::ZeroCopySend;
 pub const REQUEST_MAGIC: u32 = u32::from_le_bytes(*b"GREQ");
 /// Layout version of both headers.
 pub const REQUEST_VERSION: u32 = 1;
-/// The longest payload of a request, bytes: a plan file.
+/// Longest payload of a request, bytes: a plan file.
 pub const REQUEST_MAX_BYTES: usize = 128 * 1024;
-/// The longest payload of an answer, bytes.
+/// Longest payload of an answer, bytes.
 pub const ANSWER_MAX_BYTES: usize = 64 * 1024;
 
-/// What is asked for.
+/// A request to the daemon.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verb {
     /// 1: report the state; changes nothing.
@@ -20,13 +20,13 @@ pub enum Verb {
     Arm,
     /// 3: start servoing.
     Servo,
-    /// 4: ramp down to rest.
+    /// 4: ramp down to rest; never refused.
     Stop,
     /// 5: clear a latched fault; moves nothing.
     Reset,
-    /// 6: offer a set-point; the payload is a plan file's text.
+    /// 6: load a set-point; the payload is the text of a plan file.
     Setpoint,
-    /// 7: walk the controller out of a protective stop; ends idle.
+    /// 7: bring the controller out of a protective stop; ends in mode idle.
     Recover,
     /// 8: move the gripper's fingers; the payload is `close` or `open`.
     Gripper,
@@ -47,7 +47,7 @@ impl Verb {
         }
     }
 
-    /// The verb of a number.
+    /// The verb of a number; `None` for an unknown one.
     pub fn from_number(n: u32) -> Option<Self> {
         [Verb::Status, Verb::Arm, Verb::Servo, Verb::Stop, Verb::Reset, Verb::Setpoint, Verb::Recover, Verb::Gripper]
             .into_iter()
@@ -66,9 +66,10 @@ pub struct RequestHeader {
     pub layout_version: u32,
     /// [`Verb::number`].
     pub verb: u32,
-    /// Bytes of the payload that count; the rest is padding.
+    /// Bytes of the payload in use; the rest is padding.
     pub length: u32,
-    /// When the request was made, CLOCK_MONOTONIC nanoseconds. Verbs that start motion are refused when older than 250 ms.
+    /// Time of the request, CLOCK_MONOTONIC nanoseconds. Verbs that may lead to motion are refused when older than 250
+    /// ms.
     pub stamp_ns: u64,
 }
 
@@ -83,6 +84,6 @@ pub struct AnswerHeader {
     pub layout_version: u32,
     /// 0 accepted, 1 refused, 2 malformed.
     pub status: u32,
-    /// Bytes of the payload that count: one JSON object.
+    /// Bytes of the payload in use: one JSON object.
     pub length: u32,
 }

@@ -1,4 +1,4 @@
-//! The telemetry sample: what the loop did, in fixed layout (shm/CONTROL.md is the page for outsiders).
+//! The telemetry sample: state and figures of the loop in a fixed layout (`CONTROL.md` has the same table).
 
 use iceoryx2::prelude::ZeroCopySend;
 
@@ -6,12 +6,12 @@ use iceoryx2::prelude::ZeroCopySend;
 pub const TELEMETRY_MAGIC: u32 = u32::from_le_bytes(*b"GTEL");
 /// Layout version of [`TelemetrySample`].
 pub const TELEMETRY_VERSION: u32 = 1;
-/// Marks a sample can carry.
+/// Largest number of marks in a sample.
 pub const TELEMETRY_MARKS: usize = 32;
-/// Bytes of the text fields.
+/// Bytes of [`TelemetrySample::cause`].
 pub const TELEMETRY_TEXT: usize = 256;
 
-/// Percentiles of one latency since the last arming, microseconds.
+/// Percentiles of one latency, microseconds, since the last change from armed to servoing.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
 #[type_name("GraspdPercentiles")]
@@ -32,25 +32,26 @@ pub struct TelemetrySample {
     pub magic: u32,
     /// [`TELEMETRY_VERSION`].
     pub layout_version: u32,
-    /// Counts samples.
+    /// Number of the sample.
     pub sequence: u64,
     /// CLOCK_MONOTONIC nanoseconds of the cycle this sample describes.
     pub stamp_ns: u64,
     /// 0 idle, 1 tracking, 2 armed, 3 servoing, 4 converged, 5 stopping, 6 fault.
     pub state: u32,
-    /// Stable number of the latched fault; 0 none.
+    /// Number of the latched fault: that of its code, F-ARM-05 is 405; 0 none.
     pub fault: u32,
-    /// Step of the task: 0 none, 1 to pre-grasp, 2 to grasp, 3 hold, 4 close, 5 turn, 6 retreat.
+    /// Part of the task: 0 none, 1 to the pre-grasp, 2 to the grasp, 3 holding on the goal (gripper motion included), 5
+    /// turn, 6 retreat; 4 is unused.
     pub phase: u32,
     /// 0 stereo, 1 left, 2 right, 3 best.
     pub views: u32,
     /// Cycles of the command thread since start.
     pub ticks: u64,
-    /// Cycles that came a whole period late or later.
+    /// Cycles missed: whole periods in which the command thread did not run.
     pub overruns: u64,
     /// Stereo pairs tracked.
     pub frames: u64,
-    /// Stereo pairs that were never seen because a newer one was there.
+    /// Stereo pairs that the tracker did not see: lost, or skipped for a newer one.
     pub frames_skipped: u64,
     /// Stereo pairs refused by a check.
     pub frames_refused: u64,
@@ -62,7 +63,7 @@ pub struct TelemetrySample {
     pub robot_mode: i32,
     /// The controller's safety status bits.
     pub safety_bits: u32,
-    /// Bit set of the limits that shaped this cycle's command.
+    /// Limits that changed this cycle's command: the bits of `graspd_rt::guard::Held`.
     pub limits_active: u32,
     /// Measured joint positions, rad.
     pub q: [f64; 6],
@@ -72,39 +73,41 @@ pub struct TelemetrySample {
     pub command: [f64; 6],
     /// Commanded screw in the gripper frame, m/s and rad/s.
     pub screw: [f64; 6],
-    /// Gripper in the left camera's frame: x, y, z, then quaternion w, x, y, z; NaN before the marks were seen.
+    /// Gripper pose in the frame of the left camera: x, y, z (m), then quaternion w, x, y, z; NaN before the marks were
+    /// seen.
     pub left_from_gripper: [f64; 7],
-    /// Root mean square of the image error of all marks against the present goal, px; NaN without one.
+    /// Root mean square distance of the marks from the moving reference, px per coordinate; NaN while the law does not
+    /// drive.
     pub error_px: f64,
-    /// Residual of the pose fit, px: the health figure of the calibration at rest.
+    /// Part of `error_px` that no motion can remove, px: noise and calibration error; NaN while the law does not drive.
     pub residual_px: f64,
-    /// Distance to the goal by the daemon's own estimate, m; NaN without one.
+    /// Distance of the gripper's origin from the goal by the daemon's estimate, m; NaN without a goal.
     pub distance_m: f64,
-    /// Angle to the goal by the daemon's own estimate, rad; NaN without one.
+    /// Angle to the goal by the daemon's estimate, rad; NaN without a goal.
     pub angle_rad: f64,
-    /// Condition number of the stacked image Jacobian (unit-scaled).
+    /// Condition number of the stacked interaction matrices (unit-scaled); NaN while the law does not drive.
     pub condition: f64,
-    /// Gain of the law, 1/s.
+    /// Fraction of the full speed in force, 0 to 1 (age of data, marks, singularity, limits); not the gain of the law.
     pub gain: f64,
-    /// Marks of the gripper.
+    /// Number of marks of the gripper.
     pub mark_count: u32,
-    /// Marks seen, left and right.
+    /// Number of marks seen, left and right.
     pub marks_seen: [u32; 2],
-    /// Log lines that were lost: the log's stream is stuck, full or closed.
+    /// Log lines lost because the log's stream is blocked, full or closed.
     pub log_lost: u32,
-    /// Seen marks by view and index, px; NaN where not seen.
+    /// Pixel of each mark by view and mark index, px; NaN where not seen.
     pub marks: [[[f32; 2]; TELEMETRY_MARKS]; 2],
-    /// Goal of each mark by view and index, px; NaN where none.
+    /// Goal of each mark by view and mark index, px; NaN where there is none.
     pub goals: [[[f32; 2]; TELEMETRY_MARKS]; 2],
-    /// How late the command thread woke.
+    /// Delay of the command thread's wake-up.
     pub wakeup_us: Percentiles,
-    /// Length of the command thread's work.
+    /// Computing time of a cycle of the command thread.
     pub compute_us: Percentiles,
-    /// From the exposure of a pair to the first command that used it.
+    /// Time from the exposure of a pair to the first command that used it.
     pub frame_to_command_us: Percentiles,
-    /// From a command to its echo by the control script.
+    /// Time from a command to its echo by the control script.
     pub round_trip_us: Percentiles,
-    /// Fault code and cause, UTF-8, zero-padded.
+    /// Code and cause of the latched fault or of the last hold, UTF-8, zero-padded.
     pub cause: [u8; TELEMETRY_TEXT],
 }
 
@@ -161,7 +164,7 @@ impl TelemetrySample {
         std::str::from_utf8(&self.cause[..end]).unwrap_or("")
     }
 
-    /// Sets the cause text, cut at a character boundary when it is too long.
+    /// Sets the cause text, truncated at a character boundary to at most 255 bytes.
     pub fn set_cause(&mut self, text: &str) {
         self.cause = [0; TELEMETRY_TEXT];
         let mut end = text.len().min(TELEMETRY_TEXT - 1);

@@ -8,9 +8,15 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-/// Samples a slow reader may fall behind before it misses some.
+/// Samples that a new reader gets from before it joined.
+const HISTORY: usize = 1;
+/// Samples that a slow reader may fall behind before it misses some.
 const BUFFER: usize = 8;
-/// Readers at once: console, recorder, metrics, command line tools.
+/// Samples that a reader may hold.
+const BORROWED: usize = 2;
+/// One daemon, and its successor.
+const PUBLISHERS: usize = 2;
+/// Largest number of readers: console, recorder, metrics, command line tools.
 const SUBSCRIBERS: usize = 16;
 
 fn open(node: &ShmNode) -> Result<PortFactory<ipc::Service, TelemetrySample, ()>, ControlError> {
@@ -19,17 +25,17 @@ fn open(node: &ShmNode) -> Result<PortFactory<ipc::Service, TelemetrySample, ()>
     node.node()
         .service_builder(&parsed)
         .publish_subscribe::<TelemetrySample>()
-        .history_size(1)
+        .history_size(HISTORY)
         .subscriber_max_buffer_size(BUFFER)
-        .subscriber_max_borrowed_samples(2)
-        .max_publishers(2)
+        .subscriber_max_borrowed_samples(BORROWED)
+        .max_publishers(PUBLISHERS)
         .max_subscribers(SUBSCRIBERS)
         .enable_safe_overflow(true)
         .open_or_create()
         .map_err(|e| ControlError::open(&name, &e))
 }
 
-/// Publishes telemetry. Sending allocates inside iceoryx2: never from a real-time thread.
+/// Publishes telemetry. iceoryx2 allocates when it sends: never publish from a real-time thread.
 #[derive(Debug)]
 pub struct TelemetryPublisher {
     publisher: Publisher<ipc::Service, TelemetrySample, ()>,
@@ -40,7 +46,7 @@ impl TelemetryPublisher {
     /// Opens or creates the topic.
     ///
     /// # Errors
-    /// When the topic exists with another layout, or shared memory is refused.
+    /// The topic exists with another layout, or the shared memory cannot be used.
     pub fn new(node: &ShmNode) -> Result<Self, ControlError> {
         let service = open(node)?;
         let publisher = service.publisher_builder().create().map_err(|e| ControlError::open("telemetry", &e))?;
@@ -50,7 +56,7 @@ impl TelemetryPublisher {
     /// Publishes one sample.
     ///
     /// # Errors
-    /// When shared memory fails underneath; the next call may succeed.
+    /// iceoryx2 cannot send; the next call may succeed.
     pub fn publish(&self, sample: &TelemetrySample) -> Result<(), ControlError> {
         let loan = self.publisher.loan_uninit().map_err(|e| ControlError::io("telemetry", &e))?;
         loan.write_payload(*sample).send().map_err(|e| ControlError::io("telemetry", &e))?;
@@ -69,17 +75,17 @@ impl TelemetrySubscriber {
     /// Opens or creates the topic.
     ///
     /// # Errors
-    /// When the topic exists with another layout, or shared memory is refused.
+    /// The topic exists with another layout, or the shared memory cannot be used.
     pub fn new(node: &ShmNode) -> Result<Self, ControlError> {
         let service = open(node)?;
         let subscriber = service.subscriber_builder().create().map_err(|e| ControlError::open("telemetry", &e))?;
         Ok(Self { subscriber, _service: service })
     }
 
-    /// The oldest unread sample, if there is one. Samples of another layout version are an error, never trusted.
+    /// The oldest unread sample, if there is one.
     ///
     /// # Errors
-    /// When shared memory fails, or the publisher speaks another version.
+    /// iceoryx2 cannot receive, or the sample has another layout version.
     pub fn next(&self) -> Result<Option<TelemetrySample>, ControlError> {
         let Some(sample) = self.subscriber.receive().map_err(|e| ControlError::io("telemetry", &e))? else {
             return Ok(None);
@@ -92,5 +98,20 @@ impl TelemetrySubscriber {
             });
         }
         Ok(Some(*sample))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn control_md_documents_the_quality_of_service() {
+        for row in [
+            format!("| history / subscriber buffer / borrowed | {HISTORY} / {BUFFER} / {BORROWED} |"),
+            format!("| publishers / subscribers | {PUBLISHERS} / {SUBSCRIBERS} ("),
+        ] {
+            assert!(include_str!("../../CONTROL.md").contains(&row), "{row}");
+        }
     }
 }

@@ -1,4 +1,4 @@
-//! The request service: verbs in, JSON answers out.
+//! The request service: a client sends verbs, the daemon answers with JSON.
 
 use super::request::{
     ANSWER_MAX_BYTES, AnswerHeader, REQUEST_MAGIC, REQUEST_MAX_BYTES, REQUEST_VERSION, RequestHeader, Verb,
@@ -12,48 +12,58 @@ use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::request_response::PortFactory;
 use std::time::{Duration, Instant};
 
+/// One daemon.
+const SERVERS: usize = 1;
+/// Consoles and command line tools.
+const CLIENTS: usize = 16;
+/// A client sends the next request after the answer to the last one.
+const ACTIVE_REQUESTS: usize = 1;
+/// Answers that wait for a client.
+const RESPONSES: usize = 2;
+
 type Factory = PortFactory<ipc::Service, [u8], RequestHeader, [u8], AnswerHeader>;
 
-/// What can go wrong with telemetry and requests.
+/// An error of telemetry or requests.
 #[derive(Debug, thiserror::Error)]
 pub enum ControlError {
     /// A service could not be opened.
     #[error(
-        "shared-memory service '{service}' could not be opened ({cause}); is a program of another version running in this cell, or is the shared-memory root not yours?"
+        "shared-memory service '{service}' cannot be opened ({cause}): a program of another version may be running in this cell, or the \
+         shared-memory root may belong to another user"
     )]
     Open {
-        /// Which service.
+        /// The service.
         service: String,
-        /// What iceoryx2 said.
+        /// iceoryx2's reason.
         cause: String,
     },
     /// A send or receive failed.
     #[error("shared-memory service '{service}' failed ({cause})")]
     Io {
-        /// Which service.
+        /// The service.
         service: &'static str,
-        /// What iceoryx2 said.
+        /// iceoryx2's reason.
         cause: String,
     },
-    /// The other side speaks another layout.
-    #[error("service '{service}' speaks layout version {found}, this program {expected}; run programs of one version")]
+    /// The other process uses another layout version.
+    #[error("service '{service}' has layout version {found}, this program has {expected}: run programs of one version")]
     Version {
-        /// Which service.
+        /// The service.
         service: &'static str,
-        /// Its version.
+        /// Version of the other process.
         found: u32,
-        /// Ours.
+        /// Version of this program.
         expected: u32,
     },
-    /// Nobody answers.
+    /// No daemon answers.
     #[error("no daemon answers in this cell; start it with 'graspd run', or name its cell and shared-memory root")]
     NoDaemon,
     /// The payload is longer than the service carries.
-    #[error("the request is {length} bytes long; at most {limit} fit")]
+    #[error("the request has {length} bytes of payload, the limit is {limit}")]
     TooLong {
-        /// Its length.
+        /// Its length, bytes.
         length: usize,
-        /// The limit.
+        /// The limit, bytes.
         limit: usize,
     },
 }
@@ -76,10 +86,10 @@ fn open(node: &ShmNode) -> Result<Factory, ControlError> {
         .request_response::<[u8], [u8]>()
         .request_user_header::<RequestHeader>()
         .response_user_header::<AnswerHeader>()
-        .max_servers(1)
-        .max_clients(16)
-        .max_active_requests_per_client(1)
-        .max_response_buffer_size(2)
+        .max_servers(SERVERS)
+        .max_clients(CLIENTS)
+        .max_active_requests_per_client(ACTIVE_REQUESTS)
+        .max_response_buffer_size(RESPONSES)
         .open_or_create()
         .map_err(|e| ControlError::open(&name, &e))
 }
@@ -93,7 +103,7 @@ pub struct Answer {
     pub json: String,
 }
 
-/// Asks the daemon.
+/// A client of the daemon.
 #[derive(Debug)]
 pub struct RequestClient {
     client: Client<ipc::Service, [u8], RequestHeader, [u8], AnswerHeader>,
@@ -104,7 +114,7 @@ impl RequestClient {
     /// Opens or creates the service.
     ///
     /// # Errors
-    /// When the service exists with another layout, or shared memory is refused.
+    /// The service exists with another layout, or the shared memory cannot be used.
     pub fn new(node: &ShmNode) -> Result<Self, ControlError> {
         let service = open(node)?;
         let client = service
@@ -115,16 +125,16 @@ impl RequestClient {
         Ok(Self { client, service })
     }
 
-    /// Sends one request and waits for its answer, at most `timeout`.
+    /// Sends one request and waits at most `timeout` for its answer.
     ///
     /// # Errors
-    /// [`ControlError::NoDaemon`] when nobody answered in time.
+    /// [`ControlError::NoDaemon`] when no answer came in time.
     pub fn ask(&self, verb: Verb, payload: &[u8], stamp_ns: u64, timeout: Duration) -> Result<Answer, ControlError> {
         if payload.len() > REQUEST_MAX_BYTES {
             return Err(ControlError::TooLong { length: payload.len(), limit: REQUEST_MAX_BYTES });
         }
         let until = Instant::now() + timeout;
-        // A request that finds no server is dropped by iceoryx2, so wait for one before sending; a motion verb is sent once.
+        // iceoryx2 drops a request that finds no server, so wait for one before sending. A request is sent only once.
         while self.service.dynamic_config().number_of_servers() == 0 {
             if Instant::now() >= until {
                 return Err(ControlError::NoDaemon);
@@ -164,11 +174,11 @@ impl RequestClient {
     }
 }
 
-/// One request as the daemon sees it.
+/// A request as the daemon receives it.
 pub struct Request {
-    /// What is asked for.
+    /// The verb.
     pub verb: Verb,
-    /// When it was made, by the client's word.
+    /// Time of the request as the client states it, CLOCK_MONOTONIC nanoseconds.
     pub stamp_ns: u64,
     /// Its payload.
     pub payload: Vec<u8>,
@@ -182,7 +192,7 @@ impl std::fmt::Debug for Request {
 }
 
 impl Request {
-    /// Answers, with one JSON object. A client that is gone is not an error.
+    /// Answers with one JSON object. A client that has ended is not an error.
     pub fn answer(&self, accepted: bool, json: &str) {
         respond(&self.active, u32::from(!accepted), json);
     }
@@ -198,11 +208,11 @@ fn respond(active: &ActiveRequest<ipc::Service, [u8], RequestHeader, [u8], Answe
         status,
         length: u32::try_from(n).unwrap_or(0),
     };
-    // The client may have died between asking and our answer; there is nobody left to tell.
+    // The client may have ended before the answer; then nobody waits for it.
     let _ = loan.write_from_fn(|i| bytes.get(i).copied().unwrap_or(b' ')).send();
 }
 
-/// Receives requests.
+/// The daemon's end of the request service.
 #[derive(Debug)]
 pub struct RequestServer {
     server: Server<ipc::Service, [u8], RequestHeader, [u8], AnswerHeader>,
@@ -210,10 +220,10 @@ pub struct RequestServer {
 }
 
 impl RequestServer {
-    /// Opens or creates the service. There is one server in a cell: a second daemon is refused here.
+    /// Opens or creates the service. A cell has one server.
     ///
     /// # Errors
-    /// When another daemon serves this cell, or shared memory is refused.
+    /// Another daemon serves this cell, or the shared memory cannot be used.
     pub fn new(node: &ShmNode) -> Result<Self, ControlError> {
         let service = open(node)?;
         let server = service
@@ -224,10 +234,10 @@ impl RequestServer {
         Ok(Self { server, _service: service })
     }
 
-    /// The next well-formed request; malformed ones are answered as such here and never seen.
+    /// The next well-formed request. Malformed ones are answered with status 2 and not returned.
     ///
     /// # Errors
-    /// When shared memory fails underneath.
+    /// iceoryx2 cannot receive.
     pub fn next(&self) -> Result<Option<Request>, ControlError> {
         while let Some(active) = self.server.receive().map_err(|e| ControlError::io("requests", &e))? {
             let h = *active.user_header();
@@ -244,5 +254,17 @@ impl RequestServer {
             }
         }
         Ok(None)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn control_md_documents_the_quality_of_service() {
+        let document = include_str!("../../CONTROL.md").replace('\n', " ");
+        let text = format!("{CLIENTS} clients, one active request per client, a response buffer of {RESPONSES}");
+        assert!(document.contains(&text) && document.contains("One server") && (SERVERS, ACTIVE_REQUESTS) == (1, 1));
     }
 }

@@ -1,17 +1,17 @@
-//! Pixel formats, their sizes, and the conversion of a row to 8-bit grey.
+//! Pixel formats, their sizes, and the conversion of an image to 8-bit grey.
 
-/// How pixels are stored. The codes are part of the layout.
+/// How pixels are stored. The codes are part of the layout (`LAYOUT.md`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum PixelFormat {
-    /// One byte a pixel.
+    /// 8 bits per pixel.
     Mono8 = 1,
-    /// Twelve bits in a 16-bit word, native byte order, value 0 to 4095.
+    /// 12 bits in a 16-bit word, native byte order, value 0 to 4095.
     Mono12 = 2,
-    /// Two pixels in three bytes (GigE Vision `Mono12Packed`): high 8 bits of the first, then the low nibbles (first in the low
-    /// half), then the high 8 bits of the second.
+    /// Two pixels in three bytes (GigE Vision `Mono12Packed`): the high 8 bits of the first; the low 4 bits of both,
+    /// those of the first in the low nibble; the high 8 bits of the second.
     Mono12Packed = 3,
-    /// Sixteen bits a pixel, native byte order.
+    /// 16 bits per pixel, native byte order.
     Mono16 = 4,
     /// Bayer mosaic, 8 bits, first row red green.
     BayerRg8 = 5,
@@ -36,12 +36,12 @@ impl PixelFormat {
         PixelFormat::BayerBg8,
     ];
 
-    /// The format of a header's code; `None` for a code this version does not know.
+    /// The format of a code; `None` for an unknown code.
     pub fn from_code(code: u32) -> Option<Self> {
         Self::ALL.into_iter().find(|f| *f as u32 == code)
     }
 
-    /// Bytes that one row of `width` pixels takes, without padding.
+    /// Bytes of one row of `width` pixels, without padding.
     pub fn row_bytes(self, width: u32) -> u64 {
         let w = u64::from(width);
         match self {
@@ -51,16 +51,17 @@ impl PixelFormat {
         }
     }
 
-    /// Whether the image is a colour mosaic.
+    /// Whether the image is a Bayer mosaic.
     pub fn is_bayer(self) -> bool {
         matches!(self, Self::BayerRg8 | Self::BayerGr8 | Self::BayerGb8 | Self::BayerBg8)
     }
 }
 
-/// Converts one image to 8-bit grey, `out` being `width * height` bytes, row by row. No allocation.
+/// Converts one image to 8-bit grey, `width * height` bytes without padding. Does not allocate. Returns `false` when
+/// `data` or `out` is too short.
 ///
-/// Bayer mosaics are smoothed with the kernel 1-2-1 in both directions: at every pixel, whatever its colour, that weighs red 1/4,
-/// green 1/2 and blue 1/4, so that the four orders give the same grey and nothing shifts by half a pixel.
+/// A Bayer mosaic is filtered with the kernel 1-2-1 along both axes. At every pixel, whatever its colour, this weighs
+/// red 1/4, green 1/2 and blue 1/4, so that the four orders give the same grey and no edge shifts by half a pixel.
 pub(crate) fn to_mono8(
     format: PixelFormat,
     data: &[u8],
@@ -94,7 +95,7 @@ pub(crate) fn to_mono8(
                 }
             }
             _ => {
-                // The image is continued by reflection, which keeps the mosaic's phase.
+                // Reflection at the border keeps the phase of the mosaic.
                 let up = if y == 0 { 1.min(height - 1) } else { y - 1 };
                 let down = if y + 1 == height { y.saturating_sub(1) } else { y + 1 };
                 let (Some(a), Some(b)) = (row(up), row(down)) else { return false };
@@ -115,7 +116,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn deep_formats_keep_the_eight_high_bits() {
+    fn formats_above_8_bits_keep_the_high_8_bits() {
         let grey: Vec<u8> = (0..24).map(|i| (i * 10) as u8).collect();
         let (w, h) = (6, 4);
         let mut out = vec![0; w * h];
@@ -148,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn a_short_buffer_is_refused_not_read_past() {
+    fn short_buffers_are_refused() {
         let mut out = vec![0; 64];
         assert!(!to_mono8(PixelFormat::Mono8, &[0; 60], 8, 8, 8, &mut out));
         assert!(!to_mono8(PixelFormat::BayerRg8, &[0; 63], 8, 8, 8, &mut out));

@@ -1,13 +1,13 @@
 //! The sending side: loan, fill in place, send.
 
 use super::header::{ClockSource, StereoHeader};
+use super::uninit::{self, Loaned};
 use super::{MAX_PUBLISHERS, PixelFormat, TOPIC, check, qos};
-use crate::sys::{self, Loaned};
 use crate::{Ipc, ShmError, ShmNode};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::prelude::AllocationStrategy;
 
-/// Size and format of the images a publisher sends.
+/// Size and pixel format of the images of a publisher.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FrameGeometry {
     /// Width of each image, pixels.
@@ -21,7 +21,7 @@ pub struct FrameGeometry {
 }
 
 impl FrameGeometry {
-    /// Rows without padding.
+    /// Geometry without padding between rows.
     pub fn packed(width: u32, height: u32, format: PixelFormat) -> Self {
         let stride = format.row_bytes(width).min(u64::from(u32::MAX)) as u32;
         Self { width, height, stride, format }
@@ -46,12 +46,12 @@ impl FrameGeometry {
     }
 }
 
-/// What a camera driver says about one pair.
+/// What a camera driver states about one pair.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FrameStamp {
     /// Middle of the exposure of left and right, CLOCK_MONOTONIC nanoseconds.
     pub capture_ns: [u64; 2],
-    /// Now, CLOCK_MONOTONIC nanoseconds.
+    /// Time of sending, CLOCK_MONOTONIC nanoseconds.
     pub publish_ns: u64,
     /// Exposure time, nanoseconds.
     pub exposure_ns: u64,
@@ -73,11 +73,14 @@ pub struct FramePublisher {
 }
 
 impl FramePublisher {
-    /// Joins the cell's frame topic with one size and format for the publisher's life.
+    /// Joins the cell's frame topic. Size and format of the images are fixed for the life of the publisher.
+    ///
+    /// # Errors
+    /// An impossible geometry, a topic with another layout, or as many publishers as it allows.
     pub fn new(node: &ShmNode, geometry: FrameGeometry) -> Result<Self, ShmError> {
         let template = geometry.header();
         let bytes = 2 * geometry.image_bytes();
-        // The header's own numbers must pass the reader's checks; an empty payload of the right length stands in.
+        // The geometry must pass the reader's checks; a zeroed payload of the right length stands in for the images.
         if let Err(r) = check::geometry(&template, &vec![0; bytes]) {
             return Err(ShmError::Geometry(r));
         }
@@ -97,7 +100,8 @@ impl FramePublisher {
         Ok(Self { publisher, geometry, template, sequence: 0 })
     }
 
-    /// States who the cameras are, which calibration the driver believes in and where its stamps come from.
+    /// States the cameras' identities ([`super::id_hash`]), the identity of the driver's calibration, and the source of
+    /// the capture stamps. The default is unknown.
     pub fn identify(&mut self, cameras: [u64; 2], calibration: u64, clock: ClockSource) {
         self.template.camera_id = cameras;
         self.template.calibration_id = calibration;
@@ -114,22 +118,25 @@ impl FramePublisher {
         self.sequence
     }
 
-    /// Counts a pair as lost before publishing: the reader sees a gap of one.
+    /// Counts a pair that was lost before publishing: the reader sees a gap of one.
     pub fn skip(&mut self) {
         self.sequence += 1;
         self.template.dropped += 1;
     }
 
-    /// Loans the memory of one pair. Its bytes are those of some earlier pair: write all of them.
+    /// Loans the memory of one pair. It holds the bytes of an earlier pair: write all of them.
+    ///
+    /// # Errors
+    /// No memory is free: an earlier loan is still alive, or subscribers hold all samples.
     pub fn loan(&mut self) -> Result<FrameLoan<'_>, ShmError> {
         let bytes = 2 * self.geometry.image_bytes();
         let loan =
             self.publisher.loan_slice_uninit(bytes).map_err(|e| ShmError::Loan { bytes, reason: format!("{e:?}") })?;
-        Ok(FrameLoan { sample: sys::assume_bytes(loan), publisher: self })
+        Ok(FrameLoan { sample: uninit::assume_bytes(loan), publisher: self })
     }
 }
 
-/// The memory of one pair on its way out; dropping it sends nothing.
+/// The loaned memory of one pair; dropping it sends nothing.
 #[derive(Debug)]
 pub struct FrameLoan<'p> {
     sample: Loaned,
@@ -137,7 +144,7 @@ pub struct FrameLoan<'p> {
 }
 
 impl FrameLoan<'_> {
-    /// Left and right image, rows of the geometry's stride.
+    /// Left and right image, rows of [`FrameGeometry::stride`] bytes.
     pub fn images(&mut self) -> (&mut [u8], &mut [u8]) {
         let n = self.publisher.geometry.image_bytes();
         let payload = self.sample.payload_mut();
@@ -145,12 +152,18 @@ impl FrameLoan<'_> {
         payload.split_at_mut(n)
     }
 
-    /// Sends the pair; returns its sequence number.
+    /// Sends the pair and returns its sequence number.
+    ///
+    /// # Errors
+    /// iceoryx2 cannot send.
     pub fn send(self, stamp: &FrameStamp) -> Result<u64, ShmError> {
         self.send_with(stamp, |_| {})
     }
 
-    /// Sends the pair after `edit` has changed the header: how tests and fault injection lie about a frame.
+    /// Sends the pair after `edit` has changed its header: for tests and fault injection.
+    ///
+    /// # Errors
+    /// As [`Self::send`].
     pub fn send_with(mut self, stamp: &FrameStamp, edit: impl FnOnce(&mut StereoHeader)) -> Result<u64, ShmError> {
         self.publisher.sequence += 1;
         let sequence = self.publisher.sequence;

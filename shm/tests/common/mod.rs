@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 static NEXT: AtomicU32 = AtomicU32::new(0);
 
-/// A private place in shared memory, swept when dropped.
+/// A private root folder and prefix; their files are removed when dropped.
 pub struct Place {
     pub names: Names,
 }
@@ -40,7 +40,7 @@ pub fn now_ns() -> u64 {
     t.tv_sec as u64 * 1_000_000_000 + t.tv_nsec as u64
 }
 
-/// Polls until `f` gives something, at most for `limit`.
+/// Polls `f` for at most `limit`, until it returns a value.
 pub fn until<T>(limit: Duration, mut f: impl FnMut() -> Option<T>) -> Option<T> {
     let end = Instant::now() + limit;
     while Instant::now() < end {

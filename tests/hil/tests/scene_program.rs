@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::scenario::{Options, Scenario};
-use graspd_shm::frame::{FramePolicy, FrameSubscriber, Reject, id_hash};
+use graspd_shm::frame::{FrameError, FramePolicy, FrameSubscriber, id_hash};
 use graspd_shm::{Names, create_node};
 use serde_json::Value;
 use std::io::{BufRead, BufReader, Write};
@@ -128,17 +128,17 @@ fn frames_truth_and_faults() {
 
     // Faults show as the refusal they are meant to cause, and go when cleared.
     for (fault, reject) in [
-        (r#"{"fault":"skew","ms":8}"#, Reject::Skew),
-        (r#"{"fault":"swap","ids":true}"#, Reject::Cameras),
-        (r#"{"fault":"incomplete","eye":1}"#, Reject::Incomplete),
-        (r#"{"fault":"stamp","ms":50}"#, Reject::Future),
-        (r#"{"fault":"header","field":"width","value":4294967295}"#, Reject::Size),
-        (r#"{"fault":"header","field":"offset","value":18446744073709551610}"#, Reject::Bounds),
-        (r#"{"fault":"repeat_sequence"}"#, Reject::Sequence),
-        (r#"{"fault":"second_publisher"}"#, Reject::Foreign),
+        (r#"{"fault":"skew","ms":8}"#, FrameError::Skew),
+        (r#"{"fault":"swap","ids":true}"#, FrameError::Cameras),
+        (r#"{"fault":"incomplete","eye":1}"#, FrameError::Incomplete),
+        (r#"{"fault":"stamp","ms":50}"#, FrameError::Future),
+        (r#"{"fault":"header","field":"width","value":4294967295}"#, FrameError::Size),
+        (r#"{"fault":"header","field":"offset","value":18446744073709551610}"#, FrameError::Bounds),
+        (r#"{"fault":"repeat_sequence"}"#, FrameError::Sequence),
+        (r#"{"fault":"second_publisher"}"#, FrameError::Foreign),
     ] {
         assert_eq!(scene.ask(fault)["ok"], true, "{fault}");
-        assert!(until(|| frames.newest(now_ns()).last_reject == Some(reject)), "{fault}: {:?}", frames.stats());
+        assert!(until(|| frames.newest(now_ns()).last_error == Some(reject)), "{fault}: {:?}", frames.stats());
         assert_eq!(scene.ask(r#"{"clear":true}"#)["ok"], true);
         assert!(until(|| frames.newest(now_ns()).frame.is_some()), "{fault}: no recovery");
     }

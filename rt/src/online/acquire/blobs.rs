@@ -1,9 +1,10 @@
-//! Round blobs of a whole image, in one pass a threshold and without a heap.
+//! Round blobs of an entire image, in one pass per threshold and without a heap.
 //!
-//! The image is cut into tiles; a pixel is judged against levels of its tile and the eight round it, so that a shaded or badly lit
-//! image still gives its discs. Two levels for either polarity: half way between darkest and lightest finds discs on an even
-//! ground, between the mean and the extreme finds a disc beside something much lighter or darker. Runs are linked row by row;
-//! a blob is judged and forgotten as soon as it ends, so that memory depends on the image's width, not on its content.
+//! The image is divided into tiles. A pixel is compared with levels of its tile and the eight around it, so that discs
+//! are found in a shaded or unevenly lit image as well. There are two levels for each polarity: halfway between darkest
+//! and lightest finds discs on a uniform background, between the mean and the extreme finds a disc next to something
+//! much lighter or darker. Runs are linked row by row. A blob is evaluated and released as soon as it ends, so that
+//! memory depends on the width of the image and not on its content.
 
 use crate::geom::Pixel;
 use crate::image::ImageView;
@@ -27,7 +28,7 @@ pub struct Blob {
     pub minor: f64,
     /// Darker than its surroundings.
     pub dark: bool,
-    /// How far its area is from that of the ellipse of the same moments, relative: 0 is an ellipse.
+    /// Relative difference between its area and that of the ellipse of the same moments: 0 is an ellipse.
     pub misfit: f64,
 }
 
@@ -40,11 +41,11 @@ struct Tile {
 
 #[derive(Clone, Copy)]
 struct Levels {
-    /// The tile's own range: a tile that lies wholly on one side of its level is not looked at pixel by pixel.
+    /// Range of the tile: a tile entirely on one side of its level is not examined pixel by pixel.
     own: [u8; 2],
-    /// Below is dark, by the middle and by the mean.
+    /// Levels below which a pixel is dark: by the middle and by the mean.
     dark: [u8; 2],
-    /// Above is light.
+    /// Levels above which a pixel is light, likewise.
     light: [u8; 2],
 }
 
@@ -84,7 +85,7 @@ pub(crate) struct BlobScratch {
     merged: heapless::Vec<u16, MAX_LIVE>,
 }
 
-/// Which blobs are wanted.
+/// Limits of the blobs to be found.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct BlobLimits {
     pub(crate) min_contrast: f64,
@@ -105,7 +106,7 @@ impl BlobScratch {
         }
     }
 
-    /// Finds the round blobs of an image, dark and light; the roundest when there are more than fit.
+    /// Finds the round blobs of an image, dark and light; the roundest ones if there are more than [`MAX_BLOBS`].
     pub(crate) fn detect(
         &mut self,
         image: &ImageView<'_>,
@@ -205,7 +206,7 @@ impl BlobScratch {
     }
 
     fn root(&self, mut part: u16) -> u16 {
-        // A parent is always older than the merge that made it one; the bound only guards against a broken table.
+        // Parents cannot form a cycle; the bound only protects against a corrupt table.
         for _ in 0..MAX_LIVE {
             match self.parts.get(usize::from(part)) {
                 Some(p) if p.parent != NONE => part = p.parent,
@@ -215,7 +216,7 @@ impl BlobScratch {
         part
     }
 
-    /// Joins the runs of row `y` to the parts of the row before, makes new parts, merges parts that meet.
+    /// Links the runs of row `y` to the parts of the row before, creates new parts, and merges parts that meet.
     fn link(&mut self, now: usize, len: usize, before: usize, before_len: usize, y: usize, image: &ImageView<'_>) {
         let mut first = 0;
         self.merged.clear();
@@ -293,7 +294,7 @@ impl BlobScratch {
         into
     }
 
-    /// Judges and forgets the parts of the row before that do not go on in row `y`.
+    /// Evaluates and releases the parts of the row before that do not continue in row `y`.
     fn close(
         &mut self,
         before: usize,
@@ -309,7 +310,7 @@ impl BlobScratch {
                 continue;
             }
             let Some(p) = self.parts.get_mut(usize::from(part)) else { continue };
-            // `area` is zeroed when a part is closed: several of the row's runs may belong to it.
+            // `area` is zero once a part is closed: several runs of the row may belong to it.
             if p.parent == NONE && usize::from(p.last_row) != y && p.area > 0 {
                 let blob = judge(p, dark, limits);
                 p.area = 0;
@@ -319,14 +320,14 @@ impl BlobScratch {
                 }
             }
         }
-        // Nothing refers to merged parts any more: the runs of row `y` name roots.
+        // No run refers to a merged part any more: those of row `y` refer to roots.
         while let Some(part) = self.merged.pop() {
             self.release(part);
         }
     }
 }
 
-/// Cuts a row into runs of pixels beyond their tile's level; returns how many.
+/// Cuts a row into runs of pixels beyond the level of their tile; returns their number.
 fn cut(row: &[u8], levels: &[Levels], side: usize, dark: bool, kind: usize, runs: &mut [Run; MAX_RUNS]) -> usize {
     let mut len = 0;
     let mut open: Option<usize> = None;
@@ -361,7 +362,7 @@ fn cut(row: &[u8], levels: &[Levels], side: usize, dark: bool, kind: usize, runs
     len
 }
 
-/// Adds a run's moments; sums of x and of x squared over from..to in closed form.
+/// Adds the moments of a run: sums of x and x squared over from..to in closed form.
 fn add(p: &mut Part, run: &Run, y: usize, edge: bool) {
     let (a, b, y) = (u64::from(run.from), u64::from(run.to), y as u64);
     let n = b - a;
@@ -378,17 +379,17 @@ fn add(p: &mut Part, run: &Run, y: usize, edge: bool) {
     p.last_row = y as u16;
 }
 
-/// A part's ellipse, if it is one of a size that a mark may have.
+/// The ellipse of a part, if it is round enough and has a size that a mark may have.
 fn judge(p: &Part, dark: bool, limits: &BlobLimits) -> Option<Blob> {
     let area = f64::from(p.area);
     let largest = core::f64::consts::PI * math::sq(limits.max_radius);
-    // The flattest disc looked for is five times as long as wide.
+    // The flattest disc to be found is five times as long as wide.
     let smallest = (core::f64::consts::PI * math::sq(limits.min_radius) * 0.2).max(12.0);
     if p.border || area < smallest || area > largest {
         return None;
     }
     let (x, y) = (p.x as f64 / area, p.y as f64 / area);
-    // A pixel is not a point: its own second moment is 1/12.
+    // 1/12 is the second moment of a pixel.
     let xx = p.xx as f64 / area - x * x + 1.0 / 12.0;
     let yy = p.yy as f64 / area - y * y + 1.0 / 12.0;
     let xy = p.xy as f64 / area - x * y;
@@ -400,13 +401,13 @@ fn judge(p: &Part, dark: bool, limits: &BlobLimits) -> Option<Blob> {
     }
     let (major, minor) = (2.0 * math::sqrt(l1), 2.0 * math::sqrt(l2));
     let misfit = math::fabs(area / (core::f64::consts::PI * major * minor) - 1.0);
-    // A raster disc of radius r has its area right to about 0.15 / r.
+    // The area of a rasterized disc of radius r is accurate to about 0.15 / r, relative.
     let round = misfit < 0.04 + 0.3 / minor && minor > 0.18 * major;
     let fits = major >= limits.min_radius && major <= limits.max_radius;
     (round && fits).then_some(Blob { centre: Pixel::new(x, y), major, minor, dark, misfit })
 }
 
-/// Keeps a blob unless it is there already (found at another level) or rounder ones fill the list.
+/// Keeps a blob unless it was already found at another level, or the list is full of rounder ones.
 fn keep(blob: Blob, out: &mut heapless::Vec<Blob, MAX_BLOBS>) {
     for o in out.iter_mut() {
         let near = math::sq(0.5 * o.minor.max(blob.minor));

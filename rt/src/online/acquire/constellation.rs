@@ -1,4 +1,4 @@
-//! Which points of space are which marks: triples of equal distances, then everybody else's vote.
+//! Assigns points in space to marks: triples with equal distances propose poses, and all other marks vote on them.
 
 use super::pairs::{MAX_POINTS, StereoPoint};
 use crate::geom::{Pose, Vec3};
@@ -6,45 +6,46 @@ use crate::gripper::{Gripper, MAX_MARKS, Mark};
 use crate::math;
 use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion};
 
-/// Hypotheses kept for verification in the images.
+/// Most hypotheses kept for verification in the images.
 pub(crate) const MAX_HYPOTHESES: usize = 12;
 
-/// How well distances must agree, and how much may be tried.
+/// Tolerances of the distances, and bounds of the search.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct MatchLimits {
     /// Distance tolerance, metres.
     pub(crate) tolerance: f64,
-    /// Distance tolerance, share of the distance.
+    /// Distance tolerance as a fraction of the distance.
     pub(crate) relative: f64,
-    /// Distance tolerance by the square of the depth, 1/m: what a blob's few tenths of a pixel make of a point far away.
+    /// Distance tolerance per square of the depth, 1/m: the depth error of a distant point from a blob's few tenths of
+    /// a pixel.
     pub(crate) depth: f64,
     /// Factor by which a radius may differ.
     pub(crate) size_factor: f64,
-    /// Triples compared at most.
+    /// Most triples compared.
     pub(crate) max_triples: u64,
-    /// Poses voted on at most.
+    /// Most poses voted on.
     pub(crate) max_votes: u32,
 }
 
-/// A pose that puts marks onto points.
+/// A pose with the marks that it puts onto points.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Hypothesis {
     pub(crate) pose: Pose,
-    /// Marks that fall on a point.
+    /// Number of marks at a point.
     pub(crate) matched: u32,
     /// Sum of their squared distances, m².
     pub(crate) error: f64,
-    /// Point of each mark.
+    /// Index of the point of each mark.
     pub(crate) point: [Option<u16>; MAX_MARKS],
 }
 
-/// The rigid motion that carries one triangle onto another; `None` when either is too thin to say.
+/// The rigid motion from one triangle to another; `None` if either is too thin.
 pub(crate) fn align(from: &[Vec3; 3], to: &[Vec3; 3]) -> Option<Pose> {
     let frame = |p: &[Vec3; 3]| {
         let (u, v) = (p[1] - p[0], p[2] - p[0]);
         let (lu, n) = (math::sqrt(u.norm_squared()), u.cross(&v));
         let ln = math::sqrt(n.norm_squared());
-        // Twice the area against the square of a side: under 0.15 the third point hardly fixes the turn.
+        // Twice the area relative to the square of a side: below 0.15 the third point hardly determines the rotation.
         if !(lu > 1e-6 && ln > 0.15 * lu * lu.max(math::sqrt(v.norm_squared()))) {
             return None;
         }
@@ -62,7 +63,7 @@ pub(crate) fn align(from: &[Vec3; 3], to: &[Vec3; 3]) -> Option<Pose> {
 struct Search<'a> {
     gripper: &'a Gripper,
     points: &'a [StereoPoint],
-    /// The other camera's centre in the left frame: a mark has to face both.
+    /// Centre of the right camera in the left frame: a mark has to face both cameras.
     right_centre: Vec3,
     limits: &'a MatchLimits,
     triples: u64,
@@ -94,7 +95,7 @@ impl Search<'_> {
                 continue;
             }
             let x = (pose * nalgebra::Point3::from(m.position)).coords;
-            // A triangle's own error grows towards its far side, hence one and a half times the distance's slack.
+            // The error of a triangle grows towards its far side, hence 1.5 times the tolerance of the distance.
             let reach = 1.5 * self.slack(0.1, x.z);
             let mut best: Option<(usize, f64)> = None;
             for (i, p) in self.points.iter().enumerate() {
@@ -120,7 +121,7 @@ impl Search<'_> {
     }
 }
 
-/// Whether two poses are the same answer: within 10 degrees and 8 mm.
+/// Whether two poses are equal within 10 degrees and 8 mm.
 pub(crate) fn same(a: &Pose, b: &Pose) -> bool {
     let d = a.inverse() * b;
     let moved = (a.translation.vector - b.translation.vector).norm_squared();
@@ -128,9 +129,9 @@ pub(crate) fn same(a: &Pose, b: &Pose) -> bool {
     math::fabs(d.rotation.w) > 0.9962 && moved < 0.008 * 0.008
 }
 
-/// Finds poses under which at least four marks fall on points; best first, no two the same.
+/// Finds poses that put at least four marks onto points, best first, without duplicates.
 ///
-/// Deterministic, and bounded by `limits`; the second value says whether the bounds cut the search short.
+/// Deterministic and bounded by `limits`; the second value is whether the bounds ended the search early.
 pub(crate) fn find(
     gripper: &Gripper,
     points: &[StereoPoint],
@@ -149,7 +150,7 @@ pub(crate) fn find(
     for (ip, p) in points.iter().enumerate() {
         let z = p.position.z;
         let reach = span + s.slack(span, z);
-        // The points that may belong to one gripper with p: gathered once, so that the inner loops are short.
+        // Points that may be on one gripper with p, collected once so that the inner loops are short.
         let mut near: heapless::Vec<(usize, f64), MAX_POINTS> = heapless::Vec::new();
         for (iq, q) in points.iter().enumerate().skip(ip + 1) {
             let d = math::sqrt((q.position - p.position).norm_squared());
@@ -226,7 +227,7 @@ fn better(a: &Hypothesis, b: &Hypothesis) -> bool {
     (a.matched, -a.error) > (b.matched, -b.error)
 }
 
-/// Keeps the list sorted, one entry for each distinct pose.
+/// Inserts a hypothesis into the sorted list, with one entry per distinct pose.
 fn insert(h: Hypothesis, found: &mut heapless::Vec<Hypothesis, MAX_HYPOTHESES>) {
     if let Some(twin) = found.iter_mut().find(|f| same(&f.pose, &h.pose)) {
         if better(&h, twin) {

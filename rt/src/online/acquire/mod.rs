@@ -1,13 +1,12 @@
-//! Finding the marks from scratch: no earlier pose, no human.
+//! Acquisition: finds the marks without an earlier pose or an operator.
 //!
-//! Round blobs of both images ([`blobs`]) are paired along epipolar lines into points of space ([`pairs`]); triples
-//! of points whose distances are those of three marks propose poses, on which all other marks vote
-//! ([`constellation`]); the best few are then measured in the images to sub-pixel and must hold there. A runner-up
-//! that holds as well makes the answer ambiguous, and an ambiguous answer is refused: a gripper taken the wrong way
-//! round would be driven into something.
+//! Round blobs of both images ([`blobs`]) are paired along epipolar lines to points in space ([`pairs`]). Triples of
+//! points with the distances of three marks propose poses, on which all other marks vote ([`constellation`]). The best
+//! few poses are measured in the images to sub-pixel and must fit there. If a second pose fits as well, the result is
+//! ambiguous and is refused: with the gripper found the wrong way round the arm would be driven into an obstacle.
 //!
-//! This runs on an ordinary thread, in bounded time (some tens of milliseconds), and allocates nothing either: its
-//! memory is an [`AcquireScratch`] that the caller keeps.
+//! Runs on an ordinary thread in bounded time (some tens of milliseconds) and does not allocate: its memory is an
+//! [`AcquireScratch`] that the caller keeps.
 
 mod blobs;
 mod constellation;
@@ -30,36 +29,35 @@ use constellation::{Hypothesis, MatchLimits};
 use nalgebra::{Matrix2, Matrix6};
 use pairs::{PairLimits, StereoPoint};
 
-/// How acquisition searches and what it believes.
+/// Settings of acquisition.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AcquireSettings {
-    /// What a mark has to look like in the final measurement.
+    /// Requirements on a mark in the final measurement.
     pub marks: MarkSettings,
-    /// Smallest grey difference in a neighbourhood that is searched at all. Default 20.
+    /// Smallest grey difference of a neighbourhood that is searched. Default 20.
     pub min_contrast: f64,
-    /// Radius of the smallest and largest mark looked for, pixels. Default 2.5 to 34.
+    /// Radius of the smallest and largest mark to be found, pixels. Default 2.5 to 34.
     pub radius_px: [f64; 2],
-    /// The rig's own error: how far a pair may be from the epipolar line and marks from where a right rig had them
-    /// follows from it.
+    /// The stated error of the rig, from which the gates on epipolar distance and residual follow.
     pub rig_error: RigError,
-    /// Deviations of the epipolar distance that are let through. Default 3.5: one rig in two thousand within the
-    /// stated error is not.
+    /// Gate on the epipolar distance, standard deviations. Default 3.5: refuses one rig in two thousand of the stated
+    /// error.
     pub epipolar_sigmas: f64,
-    /// Tolerance of distances between marks: metres, and share of the distance. Default 3 mm and 2 %.
+    /// Tolerance of distances between marks: metres, and fraction of the distance. Default 3 mm and 2 %.
     pub distance: [f64; 2],
-    /// Fewest marks that must hold in each view. Default 4.
+    /// Smallest number of marks that must fit in each view. Default 4.
     pub min_marks: usize,
-    /// Largest residual of the final pose with the rig's most probable offset taken out, pixels a degree of freedom.
-    /// Default 0.75: marks measured to half a millimetre give 0.4 at 1.5 m; a handful of other discs that happen to
-    /// fit gives 1 and more.
+    /// Largest residual of the final pose after the most probable offset of the rig is removed, pixels per degree of
+    /// freedom. Default 0.75: marks measured to half a millimetre give 0.4 at 1.5 m; a few other discs that happen to
+    /// fit give 1 and more.
     pub max_residual_px: f64,
-    /// How far off the rig may seem, in deviations of its stated error (root of the sum of squares). Default 5: of
-    /// nine unknowns once in three hundred rigs if the marks saw all nine; they see about five, then once in ten
-    /// thousand.
+    /// Largest estimated offset of the rig, standard deviations of its stated error (root of the sum of squares).
+    /// Default 5: exceeded by one rig in three hundred if the marks determined all nine unknowns; they determine about
+    /// five, which gives one in ten thousand.
     pub max_rig_sigmas: f64,
-    /// Triples of points compared at most. Default 20 million.
+    /// Most triples of points compared. Default 20 million.
     pub max_triples: u64,
-    /// Poses voted on at most. Default 30 000.
+    /// Most poses voted on. Default 30 000.
     pub max_votes: u32,
 }
 
@@ -98,7 +96,7 @@ impl AcquireScratch {
         }
     }
 
-    /// The blobs of the last acquisition, for an operator's overlay.
+    /// Blobs of the last acquisition, for an overlay.
     pub fn blobs(&self, view: View) -> &[Blob] {
         &self.blobs[view.index()]
     }
@@ -110,62 +108,62 @@ impl Default for AcquireScratch {
     }
 }
 
-/// The gripper, found.
+/// Result of an acquisition.
 #[derive(Clone, Copy, Debug)]
 pub struct Acquisition {
-    /// Gripper pose in the rig, to be handed to [`super::VisionCycle::seed`].
+    /// Gripper pose in the rig, for [`super::VisionCycle::seed`].
     pub left_from_gripper: Pose,
-    /// Its covariance as a small gripper-frame screw (m, rad).
+    /// Its covariance as a small gripper-frame screw `[v; ω]` (m, rad).
     pub covariance: Matrix6<f64>,
-    /// Marks that hold in each view.
+    /// Number of marks that fit in each view.
     pub seen: [u8; 2],
-    /// Residual of those marks with the rig as its file has it, pixels.
+    /// Residual of those marks with the rig of the file, pixels.
     pub residual_px: f64,
-    /// The same with the rig's most probable offset taken out, a degree of freedom.
+    /// Residual after the most probable offset of the rig is removed, pixels per degree of freedom.
     pub inner_residual_px: f64,
-    /// How far off the rig seems, in deviations of its stated error (root of the sum of squares over its nine
+    /// Estimated offset of the rig, standard deviations of its stated error (root of the sum of squares over its
     /// unknowns).
     pub rig_sigmas: f64,
 }
 
-/// Why the gripper was not found; each says what an operator could look at.
+/// Why the gripper was not found, with what an operator can check.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum AcquireFailure {
-    /// An image has not the size of the rig's camera.
+    /// Image size mismatch with the rig's camera.
     Size(View),
     /// Fewer than four round blobs in a view: marks hidden, out of focus, dark, or smaller than 5 px.
     TooFewBlobs {
-        /// Blobs in the left and the right view.
+        /// Number of blobs in the left and the right view.
         found: [u8; 2],
     },
-    /// Blobs in both views, but too few pairs along epipolar lines with a mark's size: views swapped, rig calibration
-    /// wrong, or the gripper is in one view only.
+    /// Blobs in both views, but too few pairs with the size of a mark along epipolar lines: views swapped, wrong rig
+    /// calibration, or the gripper is in one view only.
     TooFewPairs {
-        /// Pairs found.
+        /// Number of pairs.
         found: u16,
     },
     /// Pairs in space, but no four with the distances of the gripper file: another gripper, wrong mark positions or
     /// scale.
     NoConstellation,
-    /// A pose was proposed, but too few marks hold in the images.
+    /// A pose was proposed, but too few marks fit in the images.
     NotVerified {
-        /// Marks that hold in each view under the best pose.
+        /// Number of marks that fit in each view at the best pose.
         seen: [u8; 2],
-        /// Their residual with the rig's most probable offset taken out, pixels a degree of freedom.
+        /// Their residual after the most probable offset of the rig is removed, pixels per degree of freedom.
         residual_px: f64,
     },
-    /// The marks fit, but only if the rig is far more wrong than it states: a camera was moved, the calibration is
-    /// another rig's, or the gripper is one of another size.
+    /// The marks fit only with a rig error far above the stated one: a camera was moved, the calibration is that of
+    /// another rig, or the gripper has another size.
     RigOff {
-        /// How far off the rig seems, in deviations of its stated error.
+        /// Estimated offset of the rig, standard deviations of its stated error.
         sigmas: f64,
-        /// Residual with the rig as its file has it, pixels.
+        /// Residual with the rig of the file, pixels.
         residual_px: f64,
     },
-    /// Two different poses explain the images equally well: the mark layout is symmetric, or the mark that tells is
-    /// hidden.
+    /// Two different poses fit the images equally well: the mark layout is symmetric, or the mark that distinguishes
+    /// them is hidden.
     Ambiguous {
-        /// Marks that hold under either pose.
+        /// Number of marks that fit at either pose.
         seen: [u8; 2],
     },
 }
@@ -173,7 +171,7 @@ pub enum AcquireFailure {
 /// Finds the gripper in a stereo pair.
 ///
 /// # Errors
-/// [`AcquireFailure`]: no pose at all is better than a wrong one.
+/// [`AcquireFailure`]; a doubtful pose is refused.
 pub fn acquire(
     rig: &Rig,
     gripper: &Gripper,
@@ -220,12 +218,13 @@ pub fn acquire(
     choose(rig, gripper, images, settings, scratch, &hypotheses)
 }
 
-/// A blob's centroid is off by this on its own (perspective, shading, merged rims), pixels.
+/// Error of a blob's centroid (perspective, shading, merged edges), pixels.
 const BLOB_PX: f64 = 0.3;
-/// A measured mark is off by this on its own (its place in the gripper file, shading), pixels: 0.2 mm at 1.5 m.
+/// Error of a measured mark that does not average out (its position in the gripper file, shading), pixels: 0.2 mm at
+/// 1.5 m.
 const MARK_PX: f64 = 0.15;
 
-/// Degrees of freedom that a fit takes up: six of the pose, and about five of the rig's that the marks see.
+/// Degrees of freedom of a fit: six of the pose, and about five of the rig that the marks determine.
 const FITTED: f64 = 11.0;
 
 /// A pose that was measured in the images.
@@ -244,7 +243,7 @@ impl Candidate {
         View::BOTH.map(|v| self.estimate().used_in(v) as u8)
     }
 
-    /// Residual a degree of freedom: few marks fit anything.
+    /// Residual per degree of freedom, pixels: few marks fit any pose.
     fn residual_px(&self) -> f64 {
         let rows = 2.0 * self.support() as f64;
         self.estimate().residual_px * crate::math::sqrt(rows / (rows - FITTED).max(1.0))
@@ -260,7 +259,7 @@ impl Candidate {
     }
 }
 
-/// Measures every hypothesis in the images; the best must hold, and no other as well.
+/// Measures every hypothesis in the images. The best must fit, and no other may fit as well.
 fn choose(
     rig: &Rig,
     gripper: &Gripper,
@@ -274,7 +273,7 @@ fn choose(
     let mut nearly: Option<Candidate> = None;
     let most = hypotheses.first().map_or(0, |h| h.matched);
     for h in hypotheses {
-        // Once an answer holds, one that had half of its points cannot come near it.
+        // Once a pose fits, a hypothesis with half of its points cannot compete.
         if best.is_some() && 2 * h.matched < most {
             break;
         }
@@ -310,7 +309,7 @@ fn choose(
             None => AcquireFailure::NoConstellation,
         });
     };
-    // One mark in one view more is no proof; nor is a residual that is only somewhat smaller.
+    // One more mark in one view is no proof, and neither is a slightly smaller residual.
     if let Some(r) = rival
         && r.support() + 1 >= best.support()
         && r.estimate().residual_px < 3.0 * best.estimate().residual_px + 0.1
@@ -320,7 +319,7 @@ fn choose(
     answer(rig, gripper, settings, &best)
 }
 
-/// The pose in the rig as its file has it, which is what the tracker believes, and how far off that rig seems.
+/// The pose in the rig of the file, which the tracker uses, and the estimated offset of the rig.
 fn answer(
     rig: &Rig,
     gripper: &Gripper,
@@ -346,7 +345,7 @@ fn answer(
     })
 }
 
-/// Pose and rig offset from the blobs' centroids that a hypothesis names, a few tenths of a pixel each.
+/// Pose and rig offset from the blobs' centroids of a hypothesis, each accurate to a few tenths of a pixel.
 fn from_blobs(
     rig: &Rig,
     gripper: &Gripper,
@@ -369,7 +368,7 @@ fn from_blobs(
     rig_fit::fit(rig, gripper, &table, &h.pose, &PoseSettings::default(), &settings.rig_error, 0.0)
 }
 
-/// Pose and rig offset from sub-pixel measurements of all marks that the pose shows, looked for where both put them.
+/// Pose and rig offset from sub-pixel measurements of all visible marks, searched where pose and offset put them.
 fn measured(
     rig: &Rig,
     gripper: &Gripper,

@@ -1,4 +1,4 @@
-//! Which blob of the left image may be which of the right, and where in space that would be.
+//! Pairs blobs of the left and the right image, and triangulates them.
 
 use super::blobs::{Blob, MAX_BLOBS};
 use crate::geom::{Normalized, Rig, RigError, Vec3, View};
@@ -6,34 +6,35 @@ use crate::gripper::Gripper;
 use crate::math;
 use nalgebra::Vector3;
 
-/// Points kept; an ambiguous blob gives several.
+/// Most points kept; an ambiguous blob gives several.
 pub const MAX_POINTS: usize = 512;
 
 /// A possible mark in space.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct StereoPoint {
-    /// In the left frame, metres.
+    /// Position in the left frame, metres.
     pub(crate) position: Vec3,
-    /// Radius of a disc of that image at that distance, metres.
+    /// Radius of a disc with that image at that distance, metres.
     pub(crate) radius: f64,
     pub(crate) dark: bool,
     /// Index of the blob in each view.
     pub(crate) blob: [u16; 2],
 }
 
-/// How far blobs may be from the epipolar line, and by which factor sizes may differ.
+/// Gate on the epipolar distance, and tolerance of the sizes.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PairLimits {
-    /// The rig's own error, whose deviation of the epipolar distance is what the gate follows.
+    /// The stated error of the rig, which gives the standard deviation of the epipolar distance.
     pub(crate) rig_error: RigError,
-    /// Deviations of it that are let through.
+    /// Gate on the epipolar distance, standard deviations.
     pub(crate) sigmas: f64,
-    /// What two blobs' centroids are off by on their own, pixels.
+    /// Error of the centroids of two blobs, pixels.
     pub(crate) blob_px: f64,
     pub(crate) size_factor: f64,
 }
 
-/// Pairs blobs of both views whose rays pass each other closely before both cameras, at a distance where a mark would look that large.
+/// Pairs blobs of both views whose rays pass closely in front of both cameras, at a distance at which a mark has their
+/// size.
 pub(crate) fn pair(
     rig: &Rig,
     gripper: &Gripper,
@@ -45,7 +46,7 @@ pub(crate) fn pair(
     let left_from_right = rig.right_from_left.inverse();
     let baseline = left_from_right.translation.vector;
     let [left, right] = blobs;
-    // Rays of the right view once, not once per pair.
+    // Rays of the right view are computed once, not once per pair.
     let mut rays: heapless::Vec<Option<Vec3>, MAX_BLOBS> = heapless::Vec::new();
     for b in right {
         let ray = rig.camera(View::Right).undistort(b.centre).map(|n| left_from_right.rotation * lift(n));
@@ -74,7 +75,7 @@ pub(crate) fn pair(
             {
                 continue;
             }
-            // The gap between the rays as seen from either camera, in pixels, against what the rig's error makes of it.
+            // The gap between the rays in pixels of the cameras, compared with the effect of the rig's error.
             let gap = math::sqrt((p - q).norm_squared()) * fl / s.min(t);
             let middle = (p + q) * 0.5;
             let sigma = limits.rig_error.epipolar_sigma_px(rig, &middle).unwrap_or(0.0);
@@ -93,7 +94,7 @@ fn lift(n: Normalized) -> Vec3 {
     Vector3::new(n.x, n.y, 1.0)
 }
 
-/// Parameters of the points of `a s` and `c + b t` that are nearest to each other; `None` for parallel rays.
+/// Parameters of the closest points of the rays `a s` and `c + b t`; `None` for parallel rays.
 fn closest(a: &Vec3, b: &Vec3, c: &Vec3) -> Option<(f64, f64)> {
     let (aa, bb, ab) = (a.dot(a), b.dot(b), a.dot(b));
     let det = aa * bb - ab * ab;

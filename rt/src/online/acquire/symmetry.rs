@@ -1,4 +1,4 @@
-//! Can a set of marks be mistaken for itself, turned?
+//! Detects mark layouts that acquisition could find the wrong way round.
 
 use super::constellation::align;
 use crate::geom::{Pose, Vec3};
@@ -6,15 +6,16 @@ use crate::gripper::{Gripper, MAX_MARKS, Mark};
 use crate::math;
 use nalgebra::Point3;
 
-/// Two arrangements closer than this, metres, may be taken for each other in a poor image.
+/// Distance below which two arrangements cannot be distinguished in a poor image, metres.
 const TOLERANCE: f64 = 0.003;
 type Set = heapless::Vec<usize, MAX_MARKS>;
 
-/// Whether the marks that some direction of view shows can be turned onto marks of the same kind, so that acquisition could
-/// find the gripper the wrong way round. True also for fewer than four marks, and for visible marks on one line.
+/// Whether the marks visible from some direction can be rotated onto marks of the same kind, so that acquisition could
+/// find the gripper the wrong way round. Also true for fewer than four marks, and for visible marks on one line.
 ///
-/// Every mark's own normal, and every sum of two, is tried as a direction of view. Meant for the gripper file's loader: a warning
-/// there is worth more than a refused acquisition later. Work is bounded by the fourth power of the number of marks.
+/// Every mark's normal and every sum of two normals is tried as a direction of view. Meant for the loader of the
+/// gripper file, which can warn before an acquisition is refused. Work is bounded by the fourth power of the number of
+/// marks.
 pub fn layout_is_ambiguous(gripper: &Gripper) -> bool {
     if gripper.marks.len() < 4 {
         return true;
@@ -28,7 +29,7 @@ pub fn layout_is_ambiguous(gripper: &Gripper) -> bool {
                 continue;
             }
             let seen = visible(gripper, &d.normalize());
-            // Fewer than four are refused by acquisition anyway; from there nothing can be mistaken.
+            // Acquisition refuses fewer than four marks, so nothing can be confused from there.
             if seen.len() < 4 {
                 continue;
             }
@@ -98,12 +99,12 @@ fn turns_onto_itself(gripper: &Gripper, set: &Set) -> bool {
     false
 }
 
-/// Whether a motion leaves the triple where it is.
+/// Whether a motion maps the triple onto itself.
 fn still(turn: &Pose, from: &[Vec3; 3]) -> bool {
     from.iter().all(|x| ((turn * Point3::from(*x)).coords - x).norm_squared() < math::sq(2.0 * TOLERANCE))
 }
 
-/// Whether every mark of the set lands on a mark of its kind that faces the same way.
+/// Whether a motion maps every mark of the set onto a mark of its kind that faces the same direction.
 fn covers(gripper: &Gripper, set: &Set, turn: &Pose) -> bool {
     set.iter().filter_map(|i| gripper.marks.get(*i)).all(|m| {
         let (x, n) = ((turn * Point3::from(m.position)).coords, turn.rotation * m.normal);

@@ -1,7 +1,7 @@
 //! The arm's true joints over time, learnt as a second, read-only RTDE client.
 
 use graspd_rt::arm::Joints;
-use graspd_rt::rtde::{Event, Framer, Session, Slot};
+use graspd_rt::rtde::{Event, FieldSlot, Framer, Session};
 use std::collections::VecDeque;
 use std::io::{Read, Write};
 use std::net::{TcpStream, ToSocketAddrs};
@@ -160,7 +160,7 @@ impl Arm {
         Ok(())
     }
 
-    fn take(&self, joints: Slot<Joints>, bits: Slot<u64>, values: &[u8], at_ns: u64) {
+    fn take(&self, joints: FieldSlot<Joints>, bits: FieldSlot<u64>, values: &[u8], at_ns: u64) {
         let (Some(q), Some(outputs)) = (joints.read(values), bits.read(values)) else { return };
         if q.iter().all(|v| v.is_finite()) {
             self.push(Sample { at_ns, q, outputs });
