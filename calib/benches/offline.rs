@@ -2,13 +2,15 @@
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::offline::conic::{fit_direct, fit_ml};
+use graspd_calib::offline::decide::reconstruct::reconstruct;
 use graspd_calib::offline::rim::circle::extract;
-use graspd_calib::offline::rim::cone::{ConePair, project};
-use graspd_calib::offline::rim::model::{EdgePoint, Options, RimChoice, Scatter};
+use graspd_calib::offline::rim::cone::ConePair;
+use graspd_calib::offline::rim::model::{Options, RimChoice};
 use graspd_calib::offline::rim::planar::analyse;
 use graspd_calib::offline::rim::plane::polar;
-use graspd_calib::offline::rim::reconstruct::reconstruct;
 use graspd_calib::offline::rim::synthetic::{Random, rig, rim_point, rim_tilted};
+use graspd_calib::offline::types::projection::project;
+use graspd_calib::offline::types::{EdgePoint, Scatter};
 use nalgebra::Vector3;
 use std::hint::black_box;
 use std::time::Instant;

@@ -1,10 +1,12 @@
 //! Wrong and absurd selections: none gives a wrong answer that passes more often than 1 in 1,000, none panics; and right ones pass.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
-use graspd_calib::offline::rim::cone::project;
-use graspd_calib::offline::rim::model::{EdgePoint, Options, Projection, Rim, RimChoice};
-use graspd_calib::offline::rim::reconstruct::reconstruct;
+use graspd_calib::offline::decide::reconstruct::reconstruct;
+use graspd_calib::offline::rim::model::{Options, Rim, RimChoice};
 use graspd_calib::offline::rim::synthetic::{Random, rig, rim_point, rim_tilted};
+use graspd_calib::offline::types::EdgePoint;
+use graspd_calib::offline::types::projection::Projection;
+use graspd_calib::offline::types::projection::project;
 use nalgebra::Vector3;
 use std::f64::consts::TAU;
 
@@ -41,7 +43,7 @@ fn a_thousand_well_posed_scenes_are_all_answered_and_right() {
     for i in 0..1000 {
         let rim = random_rim(&mut r);
         let both_see = p.iter().all(|q| {
-            let o = graspd_calib::offline::rim::cone::camera_centre(q).unwrap();
+            let o = graspd_calib::offline::types::projection::camera_centre(q).unwrap();
             (o - rim.centre).normalize().dot(&rim.normal) > 0.17
         });
         if !both_see {
@@ -65,8 +67,9 @@ fn a_round_rim_between_the_cameras_is_no_ellipse_before_them() {
         let p = rig(r.uniform(1.0, 2.4), 1200.0, 1.5);
         let x = Vector3::new(r.uniform(-0.05, 0.05), r.uniform(-0.05, 0.05), r.uniform(1.3, 1.7));
         let rim = rim_tilted(x, r.uniform(1.2, 1.57), r.uniform(-0.4, 0.4), 0.075, 0.075);
-        let side =
-            p.map(|q| (graspd_calib::offline::rim::cone::camera_centre(&q).unwrap() - x).normalize().dot(&rim.normal));
+        let side = p.map(|q| {
+            (graspd_calib::offline::types::projection::camera_centre(&q).unwrap() - x).normalize().dot(&rim.normal)
+        });
         if !(side[0] * side[1] < 0.0 && side.iter().all(|s| s.abs() > 0.15)) {
             continue;
         }

@@ -2,14 +2,15 @@
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::GripperFile;
+use graspd_calib::offline::decide::reconstruct::reconstruct;
 use graspd_calib::offline::edges::lens::projection;
 use graspd_calib::offline::handle::grasp::{Approach, GraspError, LEAST_MARKS, choose};
 use graspd_calib::offline::handle::setpoint::{RimObstacle, Scene, fewest_on_the_way};
 use graspd_calib::offline::handle::{FLAT, direction, gripper_pose};
-use graspd_calib::offline::rim::cone::project;
-use graspd_calib::offline::rim::model::{EdgePoint, Options, Reconstruction, RimChoice};
-use graspd_calib::offline::rim::reconstruct::reconstruct;
+use graspd_calib::offline::rim::model::{Options, Reconstruction, RimChoice};
 use graspd_calib::offline::rim::synthetic::{rim_point, rim_tilted};
+use graspd_calib::offline::types::EdgePoint;
+use graspd_calib::offline::types::projection::project;
 use graspd_rt::geom::{Camera, Pose, Rig, Vec3, View};
 use nalgebra::UnitQuaternion;
 use std::f64::consts::{PI, TAU};

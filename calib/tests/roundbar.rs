@@ -2,11 +2,13 @@
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::offline::bar::torus::{Torus, outline};
-use graspd_calib::offline::rim::cone::{camera_centre, project};
-use graspd_calib::offline::rim::model::{EdgePoint, Options, Projection, RimChoice, RimModel};
-use graspd_calib::offline::rim::reconstruct::reconstruct;
+use graspd_calib::offline::decide::reconstruct::reconstruct;
+use graspd_calib::offline::rim::model::{Options, RimChoice, RimModel};
 use graspd_calib::offline::rim::refusal::Refusal;
 use graspd_calib::offline::rim::synthetic::{Random, rig, rim_tilted};
+use graspd_calib::offline::types::EdgePoint;
+use graspd_calib::offline::types::projection::Projection;
+use graspd_calib::offline::types::projection::{camera_centre, project};
 use nalgebra::Vector3;
 use std::f64::consts::TAU;
 

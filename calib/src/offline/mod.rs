@@ -20,3 +20,5 @@ pub mod handle;
 pub mod plan;
 pub mod polyhedral;
 pub mod rim;
+pub(crate) mod statistics;
+pub mod types;

@@ -1,7 +1,8 @@
 //! A bar that was found, and by how much its outlines are those of a bar rather than the edges of something flat.
 
 use crate::offline::contour::Contour;
-use crate::offline::rim::model::{EdgePoint, Outline, Reconstruction};
+use crate::offline::rim::model::Reconstruction;
+use crate::offline::types::{EdgePoint, Outline};
 
 /// Most that an outline may leave the bar, pixels (root mean square): more, and it is something else that was followed.
 const MOST_SCATTER_PX: f64 = 0.45;

@@ -9,7 +9,7 @@
 
 use crate::offline::edges::Refined;
 use crate::offline::edges::grey_image::GreyImage;
-use crate::offline::edges::sharpen::{CORRELATED, REACH, SCALE, SLOPE_NOISE, SLOPES, slopes, tangential_width};
+use crate::offline::edges::slope::{CORRELATED, REACH, SCALE_PX, SLOPE_NOISE, SLOPES, slopes, tangential_width};
 use nalgebra::{SMatrix, SVector};
 
 /// Thinnest bar with room for a model of its shading, pixels (radius).
@@ -45,7 +45,7 @@ impl Limb {
             return None;
         }
         const PARTS: usize = 24;
-        let width = SCALE.hypot(blur);
+        let width = SCALE_PX.hypot(blur);
         let unit = width * (2.0 * std::f64::consts::PI).sqrt();
         let bell = |x: f64| (-0.5 * (x / width).powi(2)).exp() / unit;
         let n = (2.0 * SPAN / FINE) as usize;
@@ -275,7 +275,7 @@ mod tests {
                 let blur = 0.6f64.hypot((1.0f64 / 12.0).sqrt());
                 let bright = if background > 100.0 { scene.outward() } else { -scene.outward() };
                 let edge = Refined { towards_bright: bright, ..start };
-                let step = crate::offline::edges::sharpen::sharpen(&scene.image(0.0, 0), &edge, 0.3, blur);
+                let step = crate::offline::edges::separate::separate(&scene.image(0.0, 0), &edge, 0.3, blur);
                 let at = step.map_or(1.0, |s| (s.at - Pixel::new(24.0, 24.0)).dot(&scene.outward()) - scene.shift);
                 worst_step = worst_step.max(at.abs());
             }

@@ -1,12 +1,12 @@
 //! Where a bar's outlines are in an image, and which edges there are likely to be theirs.
 
 use crate::offline::bar::torus::{Torus, outline};
-use crate::offline::conic::robust::median;
 use crate::offline::contour::follow::{Place, places};
 use crate::offline::contour::{Contour, ContourPoint, ViewEdges};
 use crate::offline::rim::circle::frame_of;
-use crate::offline::rim::cone::project;
-use crate::offline::rim::model::Projection;
+use crate::offline::statistics::median;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::project;
 use graspd_rt::geom::Pixel;
 use nalgebra::Vector3;
 

@@ -8,10 +8,12 @@ use crate::offline::bar::found::BarFound;
 use crate::offline::bar::outlines::{View, support};
 use crate::offline::bar::settle::settle;
 use crate::offline::bar::torus::{Free, Ray, Torus, fit, rays};
-use crate::offline::conic::robust::median;
 use crate::offline::contour::{Contour, ViewEdges};
-use crate::offline::rim::cone::camera_centre;
-use crate::offline::rim::model::{EdgePoint, Options, Projection, Reconstruction};
+use crate::offline::rim::model::{Options, Reconstruction};
+use crate::offline::statistics::median;
+use crate::offline::types::EdgePoint;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::camera_centre;
 use nalgebra::Vector3;
 
 /// What a search found.

@@ -3,14 +3,15 @@
 use crate::offline::bar::found::BarFound;
 use crate::offline::bar::limb::{Limb, THINNEST_PX};
 use crate::offline::bar::outlines::{View, support};
+use crate::offline::bar::result::reconstruct_bar;
 use crate::offline::bar::torus::{Free, Ray, Torus, fit, rays};
-use crate::offline::conic::robust::median;
 use crate::offline::contour::Contour;
 use crate::offline::contour::follow::{Finish, STEP_PX};
 use crate::offline::edges::Refined;
-use crate::offline::edges::sharpen::sharpen;
-use crate::offline::rim::model::{EdgePoint, Options, Outline, RimChoice};
-use crate::offline::rim::reconstruct::reconstruct;
+use crate::offline::edges::separate::separate;
+use crate::offline::rim::model::Options;
+use crate::offline::statistics::median;
+use crate::offline::types::{EdgePoint, Outline};
 use graspd_rt::geom::Pixel;
 
 /// A bar thinner than this part of its ring's radius is one outline taken for two.
@@ -162,7 +163,7 @@ fn followed(
         let limb = Limb::new(blur, torus.bar / v.pixel_at(&torus.centre));
         // Away from the bar is out of the outer outline, and into the inner one.
         let finish = |r: &Refined, out: Pixel| {
-            let plain = || sharpen(v.edges.image, r, noise, blur);
+            let plain = || separate(v.edges.image, r, noise, blur);
             match &limb {
                 Some(l) => l.place(v.edges.image, r, out, noise, blur).or_else(|| {
                     let r = if sharp == Sharp::Spoilt { plain()? } else { return None };
@@ -187,8 +188,7 @@ fn followed(
         all
     };
     let (l, r) = (points(&lo, &li), points(&ro, &ri));
-    let bar = Options { rim: RimChoice::RoundBar, ..*options };
-    let found = reconstruct(&l, views[0].p, &r, views[1].p, &bar).ok()?;
+    let found = reconstruct_bar([&l, &r], [views[0].p, views[1].p], options).ok()?;
     let torus = Torus { centre: found.rim.centre, normal: found.rim.normal, core: found.rim.a, bar: found.bar_radius? };
     Some((BarFound { outer: [lo, ro], inner: [li, ri], reconstruction: found, support }, torus))
 }

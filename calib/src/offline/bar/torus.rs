@@ -4,8 +4,9 @@
 use crate::offline::conic::eigen;
 use crate::offline::conic::levenberg::{self, Linear, Problem};
 use crate::offline::rim::circle::frame_of;
-use crate::offline::rim::cone::camera_centre;
-use crate::offline::rim::model::{EdgePoint, Projection};
+use crate::offline::types::EdgePoint;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::camera_centre;
 use nalgebra::{SMatrix, SVector, Vector2, Vector3};
 use std::cell::RefCell;
 

@@ -9,7 +9,7 @@ pub mod sampson;
 
 use self::levenberg::{Linear, Problem};
 use crate::offline::conic::sampson::{Cloud, Coefficients, coefficients};
-use crate::offline::rim::model::{EdgePoint, Ellipse2, Scatter};
+use crate::offline::types::{EdgePoint, Ellipse2, Scatter};
 use nalgebra::{Matrix2, Matrix3, Matrix5, SMatrix, SVector, Vector2, Vector3};
 use std::f64::consts::PI;
 

@@ -5,7 +5,8 @@
 
 use crate::offline::conic::sampson::distance;
 use crate::offline::conic::{EllipseFit, FitError, ellipse_of, fit_direct, fit_ml, refine};
-use crate::offline::rim::model::{EdgePoint, Scatter};
+use crate::offline::statistics::{MAD, median};
+use crate::offline::types::{EdgePoint, Scatter};
 use nalgebra::Matrix3;
 
 /// The gate in robust standard deviations.
@@ -16,9 +17,6 @@ const WIDEN: f64 = 1.003;
 
 /// Steps along the contour, in medians, within which a point needs two neighbours.
 const LONELY: f64 = 8.0;
-
-/// A median absolute deviation times this is a standard deviation for Gaussian noise.
-const MAD: f64 = 1.482_602_218_505_602;
 
 /// Samples of five points: with 20 % outliers one in three is clean, with 40 % one in thirteen.
 const SAMPLES: usize = 120;
@@ -70,20 +68,6 @@ fn clean(points: &[EdgePoint], fit: &EllipseFit) -> bool {
 /// Absolute residuals in units of sigma.
 fn residuals(points: &[EdgePoint], c: &Matrix3<f64>) -> Vec<f64> {
     points.iter().map(|p| (distance(c, &p.uv) / p.sigma).abs()).collect()
-}
-
-/// Median; infinite for nothing. Not finite values count as infinite.
-pub(crate) fn median(mut v: Vec<f64>) -> f64 {
-    if v.is_empty() {
-        return f64::INFINITY;
-    }
-    for x in &mut v {
-        if !x.is_finite() {
-            *x = f64::INFINITY;
-        }
-    }
-    let k = v.len() / 2;
-    *v.select_nth_unstable_by(k, f64::total_cmp).1
 }
 
 /// Whether a handful of samples shows that a smaller set explains the points far better than the plain fit does: a spoke or a second
@@ -213,7 +197,7 @@ impl XorShift {
 mod tests {
     use super::*;
     use crate::offline::conic::conic_of;
-    use crate::offline::rim::model::Ellipse2;
+    use crate::offline::types::Ellipse2;
     use nalgebra::Vector2;
 
     fn points(outliers: usize, clustered: bool) -> (Vec<EdgePoint>, Ellipse2) {

@@ -4,7 +4,7 @@
 //! the coefficients by the model's parameters, the normal equations are `D^T A D` and `D^T g`. One pass over the points costs the
 //! same whatever the model, which is why a two-view fit with covariance takes a fraction of a millisecond.
 
-use crate::offline::rim::model::{EdgePoint, Scatter};
+use crate::offline::types::{EdgePoint, Scatter};
 use nalgebra::{Matrix3, SMatrix, SVector, Vector2};
 
 /// Coefficients `c00, c01, c11, c02, c12, c22` of a symmetric 3x3 conic.

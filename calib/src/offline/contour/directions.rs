@@ -4,7 +4,8 @@
 //! directions. So each pixel remembers which sectors of normals an edge in reach could answer. A normal in any other sector has no edge for certain; for
 //! the rest the edges themselves are looked at. Pixels are made ready by the tile, when the first of it is asked for: most of an image never is.
 
-use super::ViewEdges;
+use crate::offline::edges::EdgeMap;
+use crate::offline::edges::arcs::IdealEdges;
 use graspd_rt::geom::Pixel;
 use std::cell::OnceCell;
 
@@ -33,6 +34,32 @@ impl Directions {
         let columns = width.div_ceil(TILE);
         Self { columns, tiles: vec![OnceCell::new(); columns * height.div_ceil(TILE)] }
     }
+
+    /// Whether an edge in reach of a raw pixel inside the image could have the direction `towards_bright`, ideal pixels, to within [`ALONG`].
+    pub(super) fn may_have_edge(&self, edges: (&EdgeMap, &IdealEdges), raw: Pixel, towards_bright: Pixel) -> bool {
+        let (x, y) = (raw.x.round() as usize, raw.y.round() as usize);
+        let Some(tile) = self.tiles.get(y / TILE * self.columns + x / TILE) else { return true };
+        let tile = tile.get_or_init(|| fill_tile(edges, x / TILE * TILE, y / TILE * TILE));
+        tile[y % TILE][x % TILE] & 1 << sector(towards_bright) != 0
+    }
+}
+
+/// Makes the tile whose first pixel this is.
+fn fill_tile((map, ideal): (&EdgeMap, &IdealEdges), x0: usize, y0: usize) -> Box<Tile> {
+    let mut tile = Box::new([[0u32; TILE]; TILE]);
+    let first = Pixel::new(x0 as f64, y0 as f64);
+    map.within(first, first.add_scalar((TILE - 1) as f64), REACH, |k, column, row| {
+        let Some(edge) = ideal.get(k) else { return };
+        let sectors = sectors_round(edge.towards_bright);
+        let span = |at: usize, start: usize| {
+            let reach = REACH as usize;
+            (at.saturating_sub(reach).max(start) - start)..(at + reach + 1).min(start + TILE) - start
+        };
+        for line in tile.get_mut(span(row, y0)).unwrap_or(&mut []) {
+            line.get_mut(span(column, x0)).unwrap_or(&mut []).iter_mut().for_each(|w| *w |= sectors);
+        }
+    });
+    tile
 }
 
 /// Sector of a direction. The sectors follow the angle round in equal steps of `|y| / (|x| + |y|)`, which needs no arc tangent.
@@ -56,38 +83,10 @@ fn sectors_round(d: Pixel) -> u32 {
     ((1u32 << count) - 1).rotate_left(from)
 }
 
-impl ViewEdges<'_> {
-    /// Whether an edge in reach of a raw pixel inside the image could have the direction `towards_bright`, ideal pixels, to within [`ALONG`].
-    pub(super) fn may_have_edge(&self, raw: Pixel, towards_bright: Pixel) -> bool {
-        let d = &self.directions;
-        let (x, y) = (raw.x.round() as usize, raw.y.round() as usize);
-        let Some(tile) = d.tiles.get(y / TILE * d.columns + x / TILE) else { return true };
-        let tile = tile.get_or_init(|| self.tile(x / TILE * TILE, y / TILE * TILE));
-        tile[y % TILE][x % TILE] & 1 << sector(towards_bright) != 0
-    }
-
-    /// Makes the tile whose first pixel this is.
-    fn tile(&self, x0: usize, y0: usize) -> Box<Tile> {
-        let mut tile = Box::new([[0u32; TILE]; TILE]);
-        let first = Pixel::new(x0 as f64, y0 as f64);
-        self.map.within(first, first.add_scalar((TILE - 1) as f64), REACH, |k, column, row| {
-            let Some(edge) = self.arcs.ideal.get(k) else { return };
-            let sectors = sectors_round(edge.towards_bright);
-            let span = |at: usize, start: usize| {
-                let reach = REACH as usize;
-                (at.saturating_sub(reach).max(start) - start)..(at + reach + 1).min(start + TILE) - start
-            };
-            for line in tile.get_mut(span(row, y0)).unwrap_or(&mut []) {
-                line.get_mut(span(column, x0)).unwrap_or(&mut []).iter_mut().for_each(|w| *w |= sectors);
-            }
-        });
-        tile
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::offline::contour::ViewEdges;
     use crate::offline::edges::grey_image::GreyImage;
     use graspd_rt::geom::{Camera, Distortion};
 

@@ -3,10 +3,11 @@
 //! Growing a contour asks which edges lie on one ellipse. Here the curve is given (the outline of a bar is no ellipse), and only the edges next to
 //! it are wanted, one for each stretch that is independent of its neighbours, told apart from nearby ones and brought to their place.
 
+use crate::offline::contour::one_ellipse::{Contour, ContourPoint, FLOOR_PX, INDEPENDENT_PX, LEAST_COVERAGE};
 use crate::offline::contour::quick_fit::{Sums, Walk};
-use crate::offline::contour::{Contour, ContourPoint, FLOOR_PX, INDEPENDENT_PX, LEAST_COVERAGE, ViewEdges};
+use crate::offline::contour::view_edges::ViewEdges;
 use crate::offline::edges::Refined;
-use crate::offline::rim::model::{EdgePoint, Outline};
+use crate::offline::types::{EdgePoint, Outline};
 use graspd_rt::geom::Pixel;
 
 /// A place on a predicted curve, ideal pixels.

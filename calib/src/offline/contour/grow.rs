@@ -1,13 +1,11 @@
 //! Trial ellipses through a seed edge, and how well the edges of the image support them.
 
 use crate::offline::contour::directions::{ALONG, REACH};
+use crate::offline::contour::one_ellipse::{LEAST_COVERAGE, alike};
 use crate::offline::contour::quick_fit::{Sums, Walk};
-use crate::offline::contour::{LEAST_COVERAGE, ViewEdges, alike};
+use crate::offline::contour::view_edges::ViewEdges;
 use crate::offline::edges::arcs::IdealEdge;
-use crate::offline::rim::model::Ellipse2;
-
-/// Places at which a trial ellipse is judged at most.
-pub(super) const MOST_PLACES: usize = 160;
+use crate::offline::types::Ellipse2;
 
 /// Places of a glance at a trial ellipse, in quarters.
 const GLANCES: usize = 8;

@@ -3,7 +3,7 @@
 //! The method is that of Halir and Flusser; the sums of two arcs add, so that trying a pair of arcs costs one small eigenproblem.
 //! It finds contours; what is reported is fitted anew by maximum likelihood.
 
-use crate::offline::rim::model::Ellipse2;
+use crate::offline::types::Ellipse2;
 use graspd_rt::geom::Pixel;
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 use std::cell::OnceCell;

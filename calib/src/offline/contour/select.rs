@@ -3,8 +3,10 @@
 //! A click near a painted line means one of its two edges, and nobody knows which; the other view decides. So a selection gives a few contours, the
 //! likeliest first, each through edges next to the click, and the pair that is the image of one rim is taken (see [`crate::offline::decide::pairing`]).
 
+use crate::offline::contour::grow::Trial;
+use crate::offline::contour::one_ellipse::{Contour, LEAST_COVERAGE, alike};
 use crate::offline::contour::quick_fit::Walk;
-use crate::offline::contour::{Contour, LEAST_COVERAGE, Trial, ViewEdges, alike};
+use crate::offline::contour::view_edges::ViewEdges;
 use graspd_rt::geom::{Pixel, View};
 
 /// What was selected in one view, raw pixels.

@@ -1,7 +1,7 @@
 //! Contours that pass a click without an edge there: where a rim crosses a shadow as dark as itself, only the rest of it shows.
 
-use super::ViewEdges;
-use super::quick_fit::{Sums, Walk};
+use crate::offline::contour::quick_fit::{Sums, Walk};
+use crate::offline::contour::view_edges::ViewEdges;
 use graspd_rt::geom::Pixel;
 
 /// An arc has to turn by this to say where its ellipse goes on, radians, and to have so many edges.

@@ -4,7 +4,10 @@
 //! [`spots`] matches distinctive patches, [`rig_error`] estimates the rig's error from them and carries what stays
 //! unknown, [`tangency`] is the paper's test on two conics. Nothing here knows a rim or a bar.
 
+pub mod epipolar;
 pub(in crate::offline) mod refine;
 pub mod rig_error;
+mod rig_fit;
+pub mod rig_prior;
 pub mod spots;
 pub mod tangency;

@@ -5,12 +5,12 @@
 //! other along the lines, and in front of both cameras, where the rig says that they have to be; in the right order
 //! they are found, in the wrong one their lines run elsewhere, or their places lie behind the cameras.
 
+use crate::offline::correspondence::epipolar::Match;
 use crate::offline::correspondence::refine;
-use crate::offline::correspondence::rig_error::Match;
 use crate::offline::edges::grey_image::GreyImage;
 use crate::offline::edges::lens::Lens;
-use crate::offline::rim::cone::camera_centre;
-use crate::offline::rim::model::Projection;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::camera_centre;
 use graspd_rt::geom::Pixel;
 use nalgebra::Vector3;
 

@@ -5,7 +5,7 @@
 //! tangent to the right one.
 
 use crate::offline::conic::{EllipseFit, ellipse_of};
-use crate::offline::rim::model::Projection;
+use crate::offline::types::projection::Projection;
 use nalgebra::{Matrix3, Vector2, Vector3, Vector4};
 
 /// The two epipolar tangency gaps in the right image, pixels, signed; NaN where the epipole lies inside the left

@@ -35,9 +35,10 @@ pub(in crate::offline) fn average(r: &mut Reconstruction, other: &Reconstruction
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::offline::rim::model::{EdgePoint, Options, Outline, RimChoice};
-    use crate::offline::rim::reconstruct::reconstruct;
+    use crate::offline::decide::reconstruct::reconstruct;
+    use crate::offline::rim::model::{Options, RimChoice};
     use crate::offline::rim::synthetic::{Random, rig, rim_points, rim_tilted};
+    use crate::offline::types::{EdgePoint, Outline};
     use nalgebra::{SVector, Vector3};
 
     /// Centre and normal relative to a circle's, drawn from a reconstruction's own covariance.

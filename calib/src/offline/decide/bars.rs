@@ -5,8 +5,9 @@ use crate::offline::bar::torus::Torus;
 use crate::offline::correspondence::rig_error::RigError;
 use crate::offline::decide::likelihood::{Fitted, Hypothesis, Shape, Stretch, fit};
 use crate::offline::decide::models::{Model, UNEVEN, Weighed, each_alone, prior, stretch, unrelated_px};
-use crate::offline::rim::model::{Options, Outline, RimModel};
+use crate::offline::rim::model::{Options, RimModel};
 use crate::offline::rim::planar::{Analysis, analyse};
+use crate::offline::types::Outline;
 
 /// What is known of a bar whose diameter somebody said: callipers on a painted bar are good to a hundredth of it.
 const SAID: f64 = 0.01;
@@ -44,7 +45,7 @@ impl FourOutlines {
             stretches.iter().enumerate().map(|(n, s)| Stretch { shape: n % 2, ..s.clone() }).collect();
         let plain = |n: usize| -> Vec<_> {
             let points = apart.get(n).map(|s| s.points.as_slice()).unwrap_or_default();
-            points.iter().map(|q| crate::offline::rim::model::EdgePoint { outline: Outline::Outer, ..*q }).collect()
+            points.iter().map(|q| crate::offline::types::EdgePoint { outline: Outline::Outer, ..*q }).collect()
         };
         let lenient = Options { robust: true, ..*options };
         let outer = analyse([&plain(0), &plain(2)], p, &lenient).ok()?;

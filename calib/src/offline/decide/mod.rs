@@ -5,9 +5,12 @@
 //! winner; [`pairing`] decides for two selections, [`propose`] does without a selection.
 
 pub(in crate::offline) mod average;
+mod bar_or_plane;
 pub(in crate::offline) mod bars;
+mod judged;
 pub(in crate::offline) mod likelihood;
 pub(in crate::offline) mod models;
 pub mod pairing;
 pub mod propose;
+pub mod reconstruct;
 pub(in crate::offline) mod result;

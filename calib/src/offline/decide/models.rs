@@ -5,9 +5,11 @@ use crate::offline::contour::Contour;
 use crate::offline::correspondence::rig_error::RigError;
 use crate::offline::decide::likelihood::{Fitted, Hypothesis, Shape, Stretch, fit};
 use crate::offline::rim::circle::signed_axis;
-use crate::offline::rim::cone::{camera_centre, ray};
-use crate::offline::rim::model::{Ellipse2, Outline, Projection, Rim, RimChoice};
+use crate::offline::rim::model::{Rim, RimChoice};
 use crate::offline::rim::planar::Analysis;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::{camera_centre, ray};
+use crate::offline::types::{Ellipse2, Outline};
 use nalgebra::Vector2;
 
 /// A model of some contours.
@@ -188,9 +190,9 @@ pub(in crate::offline) fn probabilities(logs: &[f64]) -> Vec<f64> {
 mod tests {
     use super::*;
     use crate::offline::conic::{ellipse_of, orient};
-    use crate::offline::rim::cone::project;
-    use crate::offline::rim::model::EdgePoint;
     use crate::offline::rim::synthetic::{rig, rim_point, rim_points, rim_tilted};
+    use crate::offline::types::EdgePoint;
+    use crate::offline::types::projection::project;
     use graspd_rt::geom::{Camera, Distortion, Rig};
     use nalgebra::{Matrix3, Vector3};
 

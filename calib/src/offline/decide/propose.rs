@@ -3,8 +3,10 @@
 use crate::offline::contour::quick_fit::Walk;
 use crate::offline::contour::select::Candidate;
 use crate::offline::contour::{Contour, ViewEdges, alike};
-use crate::offline::rim::model::{Ellipse2, Options, Outline, Projection, Reconstruction, RimChoice};
-use crate::offline::rim::reconstruct::reconstruct;
+use crate::offline::decide::reconstruct::reconstruct;
+use crate::offline::rim::model::{Options, Reconstruction, RimChoice};
+use crate::offline::types::projection::Projection;
+use crate::offline::types::{Ellipse2, Outline};
 
 /// A rim proposed to the operator.
 #[derive(Clone, Debug)]

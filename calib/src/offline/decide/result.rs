@@ -2,12 +2,14 @@
 
 use crate::offline::correspondence::rig_error::RigError;
 use crate::offline::decide::likelihood::{Fitted, Shape, Stretch, corrected};
+use crate::offline::rim::choice::base_report;
 use crate::offline::rim::circle::{check_front, frame_of, signed_axis, vergence};
-use crate::offline::rim::cone::project;
-use crate::offline::rim::model::{EdgePoint, Projection, Reconstruction, Rim, RimModel, Score};
+use crate::offline::rim::model::{Reconstruction, Rim, RimModel, Score};
 use crate::offline::rim::planar::Analysis;
-use crate::offline::rim::reconstruct::base_report;
 use crate::offline::rim::refusal::Refusal;
+use crate::offline::types::EdgePoint;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::project;
 use nalgebra::{DMatrix, Matrix2, Matrix2x3, Matrix3, SMatrix, SVector, Vector2, Vector3};
 
 /// Where a gripper's marks stand on the grasp: at this distance from the axis and this far before the rim's plane,

@@ -4,8 +4,11 @@
 //! arithmetic. So only the rows that a row's neighbourhood needs are kept, and they stay in the cache.
 
 use crate::offline::edges::grey_image::GreyImage;
-use crate::offline::edges::{RADIUS, SCALE};
 
+/// Standard deviation of the Gaussian whose derivatives are taken, pixels.
+pub const SCALE: f64 = 1.0;
+/// Radius of the sampled kernel, pixels.
+pub(super) const RADIUS: usize = 4;
 /// Samples of a kernel.
 const TAPS: usize = 2 * RADIUS + 1;
 /// Pixels that are worked on together: their sums stay in registers.

@@ -1,6 +1,6 @@
 //! Between the pixels of an image and those of the ideal pinhole in which conics are conics.
 
-use crate::offline::rim::model::Projection;
+use crate::offline::types::projection::Projection;
 use graspd_rt::geom::{Camera, Distortion, Pixel, Rig, View};
 use nalgebra::{Matrix3, Matrix3x4};
 

@@ -1,10 +1,12 @@
 //! The conic in its plane (section 4.3.3): cut, centre, semi-axes and directions, in a Euclidean frame of the plane.
 
 use crate::offline::conic::ellipse_of;
-use crate::offline::rim::cone::{ConePair, depth, third_row};
-use crate::offline::rim::model::{Projection, Rim};
+use crate::offline::rim::cone::ConePair;
+use crate::offline::rim::model::Rim;
 use crate::offline::rim::plane::{PlanePair, face, select};
 use crate::offline::rim::refusal::Refusal;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::{depth, third_row};
 use graspd_rt::geom::View;
 use nalgebra::{Matrix3, Matrix4, SMatrix, Vector3, Vector4};
 

@@ -9,8 +9,9 @@ use crate::offline::conic::levenberg::{self, Linear, Problem};
 use crate::offline::conic::sampson::{Cloud, coefficients};
 use crate::offline::conic::{conic_derivative, image_of_unit_circle, orient};
 use crate::offline::rim::circle::{frame_of, signed_axis};
-use crate::offline::rim::model::{Projection, Rim, RimModel};
+use crate::offline::rim::model::{Rim, RimModel};
 use crate::offline::rim::refusal::Refusal;
+use crate::offline::types::projection::Projection;
 use nalgebra::{Matrix2, Matrix3, Matrix3x2, Matrix4, SMatrix, SVector, Vector2, Vector3};
 
 /// Edge points of both views ready for fitting, with their cameras.
@@ -321,8 +322,8 @@ impl Problem<8> for RimProblem<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::offline::rim::model::{EdgePoint, Scatter};
     use crate::offline::rim::synthetic::{rig, rim_points, rim_tilted};
+    use crate::offline::types::{EdgePoint, Scatter};
 
     fn views(noise: f64) -> (TwoViews, Rim) {
         let rim = rim_tilted(Vector3::new(0.03, -0.04, 1.5), 0.6, 1.1, 0.075, 0.06);

@@ -3,6 +3,7 @@
 //! [`cone`] is 4.1, [`pencil`] 4.2, [`plane`] 4.3.1 and 4.3.2, [`circle`] 4.3.3; [`planar`] runs them, [`ml`] refines, [`reconstruct`] chooses the model
 //! ([`model`] says what comes out, [`refusal`] why nothing does).
 
+pub mod choice;
 pub mod circle;
 pub mod cone;
 pub mod ml;
@@ -10,6 +11,5 @@ pub mod model;
 pub mod pencil;
 pub mod planar;
 pub mod plane;
-pub mod reconstruct;
 pub mod refusal;
 pub mod synthetic;

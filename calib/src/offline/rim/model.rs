@@ -1,6 +1,6 @@
 //! The values that go into and come out of a reconstruction: edge points, rim models, options, result and report.
 //!
-//! The entry is [`crate::offline::rim::reconstruct::reconstruct`]:
+//! The entry is [`crate::offline::decide::reconstruct::reconstruct`]:
 //!
 //! ```text
 //! fn reconstruct(left: &[EdgePoint], p_left: &Projection, right: &[EdgePoint], p_right: &Projection, options: &Options)
@@ -9,43 +9,8 @@
 //!
 //! Lengths are in whatever unit the projection matrices use (metres in graspd, millimetres in the golden cases).
 
-use nalgebra::{Matrix2, Matrix3, Matrix3x2, Matrix3x4, Vector2, Vector3};
-
-/// A finite camera, `u = P x` (paper equation 1): pixels free of distortion from homogeneous points. Scale and sign do not matter.
-pub type Projection = Matrix3x4<f64>;
-
-/// Which outline of a rim an edge point belongs to.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
-pub enum Outline {
-    /// The only outline of a sharp or painted edge, or the outer one of a bar.
-    #[default]
-    Outer,
-    /// The inner outline of a round bar.
-    Inner,
-}
-
-/// An edge point: pixels of an ideal pinhole (distortion removed) and its standard deviation across the edge.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct EdgePoint {
-    /// Undistorted pixel.
-    pub uv: Vector2<f64>,
-    /// Standard deviation across the edge, pixels. Only the ratios matter unless [`Noise::AtLeastGiven`] is chosen.
-    pub sigma: f64,
-    /// The outline it lies on.
-    pub outline: Outline,
-}
-
-impl EdgePoint {
-    /// A point on the (outer) outline.
-    pub fn new(u: f64, v: f64, sigma: f64) -> Self {
-        Self { uv: Vector2::new(u, v), sigma, outline: Outline::Outer }
-    }
-
-    /// A point on the inner outline of a round bar.
-    pub fn inner(u: f64, v: f64, sigma: f64) -> Self {
-        Self { uv: Vector2::new(u, v), sigma, outline: Outline::Inner }
-    }
-}
+use crate::offline::types::{Ellipse2, Scatter};
+use nalgebra::{Matrix2, Matrix3, Matrix3x2, Vector3};
 
 /// What the rim is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -82,16 +47,6 @@ pub enum Noise {
     FromFit,
     /// From the residuals, but never below what `EdgePoint::sigma` says.
     AtLeastGiven,
-}
-
-/// In which direction edge points scatter about the contour. The difference is `kappa sigma^2 / 2`, below 0.003 px on ordinary edges.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
-pub enum Scatter {
-    /// Equally in all directions: first-order distances have no bias.
-    #[default]
-    Isotropic,
-    /// Across the edge only, as an edge detector's sub-pixel step along the gradient does: orthogonal distances have no bias.
-    Across,
 }
 
 /// What to assume and what to tolerate.
@@ -148,19 +103,6 @@ impl Options {
     pub(in crate::offline) fn tolerating_anything(self) -> Self {
         Self { max_sigma_centre: Some(f64::INFINITY), max_sigma_normal: f64::INFINITY, ..self }
     }
-}
-
-/// An ellipse in an image or in a plane: centre, semi-axes `a >= b > 0`, direction of `a` in `[0, pi)` from x towards y.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Ellipse2 {
-    /// Centre.
-    pub centre: Vector2<f64>,
-    /// Semi-major axis.
-    pub a: f64,
-    /// Semi-minor axis.
-    pub b: f64,
-    /// Direction of the major axis, radians.
-    pub theta: f64,
 }
 
 /// A rim in space as a value: an ellipse, circle or the core circle of a bar.

@@ -9,10 +9,13 @@ use crate::offline::correspondence::tangency::{excess_limit, gaps_with_sigma};
 use crate::offline::rim::circle::{ClosedForm, between_cameras, check_depth, check_front, extract};
 use crate::offline::rim::cone::{ConePair, check_cameras};
 use crate::offline::rim::ml::{MlFit, TwoViews};
-use crate::offline::rim::model::{EdgePoint, Noise, Options, Projection, Rim, RimModel};
+use crate::offline::rim::model::{Noise, Options, Rim, RimModel};
 use crate::offline::rim::pencil::Pencil;
 use crate::offline::rim::plane::{paper, polar};
 use crate::offline::rim::refusal::Refusal;
+use crate::offline::statistics::median;
+use crate::offline::types::EdgePoint;
+use crate::offline::types::projection::Projection;
 use graspd_rt::geom::View;
 use nalgebra::Vector3;
 
@@ -86,7 +89,7 @@ pub(crate) fn usable(points: &[EdgePoint]) -> Result<(), Refusal> {
 
 /// Median sigma of a set of points: turns units of sigma into pixels.
 pub(crate) fn typical_sigma(points: &[EdgePoint]) -> f64 {
-    robust::median(points.iter().map(|p| p.sigma).collect())
+    median(points.iter().map(|p| p.sigma).collect())
 }
 
 /// Ellipse fit of a view with the refusals that concern one view.

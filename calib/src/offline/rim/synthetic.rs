@@ -1,8 +1,9 @@
 //! Scenes for this crate's own tests and for the accuracy study: a verged rig and rims seen by it, as the reference generates them.
 
 use crate::offline::rim::circle::frame_of;
-use crate::offline::rim::cone::project;
-use crate::offline::rim::model::{Projection, Rim};
+use crate::offline::rim::model::Rim;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::project;
 use nalgebra::{Matrix3, Vector2, Vector3};
 use std::f64::consts::TAU;
 

@@ -1,13 +1,13 @@
 //! The linear model of all edge points at one state: how each residual changes with the shapes, the rig and a
 //! displacement of unrelated contours.
 
-use super::shape::{Place, SHAPE};
-use super::{Hypothesis, OUTLIER_SIGMAS, Shape, Stretch, corrected, solve};
-use crate::offline::conic::robust::median;
+use super::model::{Hypothesis, OUTLIER_SIGMAS, Stretch, USUAL_WAVE_PX, corrected};
+use super::shape::{Place, SHAPE, Shape};
 use crate::offline::correspondence::rig_error::RigError;
 use crate::offline::rim::circle::frame_of;
-use crate::offline::rim::cone::camera_centre;
-use crate::offline::rim::model::Projection;
+use crate::offline::statistics::median;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::camera_centre;
 use nalgebra::{DMatrix, DVector, Vector2, Vector3};
 
 /// How far the second edge of a flat ring lies from coaxial with the first: across and along the axis as a fraction
@@ -195,7 +195,7 @@ impl Linear {
         let each = || self.places.iter().zip(&self.sigma).map(|(p, s)| (p.residual.abs(), *s));
         let scale = 1.48 * median(each().map(|(r, s)| r / s).collect());
         let scale = if round == 0 { scale.max(1.0) } else { scale.max(kappa) };
-        let smooth = 2.0 * solve::USUAL_WAVE_PX;
+        let smooth = 2.0 * USUAL_WAVE_PX;
         each().map(|(r, s)| r <= OUTLIER_SIGMAS * (scale * s).hypot(smooth)).collect()
     }
 }

@@ -5,7 +5,9 @@ use crate::offline::bar::torus::{Torus, rays};
 use crate::offline::conic::sampson::distance;
 use crate::offline::conic::{image_of_unit_circle, orient};
 use crate::offline::rim::circle::{frame_of, signed_axis};
-use crate::offline::rim::model::{EdgePoint, Projection, Rim};
+use crate::offline::rim::model::Rim;
+use crate::offline::types::EdgePoint;
+use crate::offline::types::projection::Projection;
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 
 /// Usual radius of a bar as a fraction of its ring's, and how far bars differ from it, as a natural logarithm: hand
@@ -243,8 +245,8 @@ fn homography(p: &Projection, r: &Rim) -> Matrix3<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::offline::rim::model::Outline;
     use crate::offline::rim::synthetic::{rig, rim_points, rim_tilted};
+    use crate::offline::types::Outline;
 
     /// Edge points a little beside the outline of an ellipse that is near every shape of the test.
     fn near(p: &Projection) -> Vec<EdgePoint> {

@@ -2,7 +2,7 @@
 //! sizes.
 
 use super::linear::Linear;
-use super::{OUTLIER_SIGMAS, Stretch};
+use super::model::{OUTLIER_SIGMAS, Stretch, USUAL_WAVE_PX};
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 
 /// Waves of smooth edge error round a contour, relative to each other, by number of periods: slow ones move whole
@@ -12,8 +12,7 @@ const WAVES: [f64; 7] = [1.0, 1.0, 0.6, 0.4, 0.3, 0.3, 0.3];
 const COLUMNS: usize = 2 * WAVES.len() - 1;
 /// Sizes of the smooth edge error that are compared, pixels.
 const WAVE_PX: [f64; 7] = [0.02, 0.035, 0.06, 0.1, 0.18, 0.32, 0.6];
-/// Its expected size, pixels, and how far that is off as a natural logarithm: detected edges show 0.03 to 0.15.
-pub(super) const USUAL_WAVE_PX: f64 = 0.07;
+/// Spread of its size about [`USUAL_WAVE_PX`], natural logarithm: detected edges show 0.03 to 0.15 px.
 const WAVE_SPREAD: f64 = 0.7;
 /// No smooth edge error at all.
 pub(super) const NO_WAVES: Option<f64> = None;

@@ -1,63 +1,21 @@
-//! From edge points in two views to a rim in space: the chain of section 4, refined, with the model chosen and the doubts spelt out.
+//! CHOICE
 
-use crate::offline::bar::torus::Torus;
-use crate::offline::bar::{bar_result, fit_bar};
-use crate::offline::conic::robust::GATE;
 use crate::offline::conic::sampson::distance;
 use crate::offline::rim::circle::vergence;
 use crate::offline::rim::ml::{MlFit, image_conic};
-use crate::offline::rim::model::{
-    EdgePoint, Noise, Options, Outline, Projection, Reconstruction, Report, RimChoice, RimModel, Score,
-};
-use crate::offline::rim::planar::{Analysis, analyse};
+use crate::offline::rim::model::{Noise, Options, Reconstruction, Report, RimChoice, RimModel, Score};
+use crate::offline::rim::planar::Analysis;
 use crate::offline::rim::refusal::Refusal;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::{EdgePoint, Outline};
 
 /// Limit of the centre's standard deviation as a fraction of the radius when the task states none.
 const CENTRE_FRACTION: f64 = 0.1;
 /// Chi-squared by which a circle may fit worse than an ellipse with its two more parameters (four standard deviations for two degrees of freedom).
 const BETWEEN: f64 = 19.4;
 
-/// Reconstructs a rim from the edge points of both views.
-///
-/// Points are pixels without distortion; matrices in any length unit and frame, of any scale and sign. Points of the inner outline
-/// matter to the round-bar model only.
-///
-/// # Errors
-/// A [`Refusal`] that says what is wrong and what to change. Never panics, whatever the input.
-pub fn reconstruct(
-    left: &[EdgePoint],
-    p_left: &Projection,
-    right: &[EdgePoint],
-    p_right: &Projection,
-    options: &Options,
-) -> Result<Reconstruction, Refusal> {
-    let outer = [left, right].map(|v| v.iter().filter(|p| p.outline == Outline::Outer).copied().collect::<Vec<_>>());
-    let p = [p_left, p_right];
-    let analysis = analyse([&outer[0], &outer[1]], p, options)?;
-    let points = [left, right];
-    match options.rim {
-        RimChoice::Edge | RimChoice::Circle | RimChoice::Ellipse => plane(&analysis, points, p, options),
-        RimChoice::RoundBar => {
-            let bar = fit_bar(points, p, &analysis, options)?;
-            let scores = vec![score(RimModel::RoundBar, bar.fit.chi2, bar.fit.parameters, bar.count, bar.noise)];
-            bar_result(&bar, scores, &analysis, points, p, options)
-        }
-        RimChoice::Auto => any_model(&analysis, points, p, options),
-    }
-}
-
-/// The bar that fits contours as outer outlines, however well they determine it.
-pub(crate) fn bar_start(
-    points: [&[EdgePoint]; 2],
-    p: [&Projection; 2],
-    analysis: &Analysis,
-    options: &Options,
-) -> Option<Torus> {
-    fit_bar(points, p, analysis, options).ok().map(|bar| bar.fit.torus)
-}
-
 /// The plane models alone.
-fn plane(
+pub(crate) fn plane(
     a: &Analysis,
     points: [&[EdgePoint]; 2],
     p: [&Projection; 2],
@@ -66,88 +24,6 @@ fn plane(
     a.verdict.clone()?;
     let (fit, scores) = choose_plane_model(a, options.rim, options)?;
     Ok(plane_result(a, &fit, scores, points, p, options))
-}
-
-/// Plane edge or round bar, by the information criterion over the same points.
-fn any_model(
-    a: &Analysis,
-    points: [&[EdgePoint]; 2],
-    p: [&Projection; 2],
-    options: &Options,
-) -> Result<Reconstruction, Refusal> {
-    let inner = points.map(|v| v.iter().filter(|q| q.outline == Outline::Inner).copied().collect::<Vec<_>>());
-    let both = inner.iter().all(|v| v.len() >= 10);
-    let flat = plane(a, points, p, options);
-    // One outline without the bar's diameter: a bar would only add a parameter that it cannot determine, and with it the freedom to
-    // explain two contours that are no pair.
-    if !both && options.bar_diameter.is_none() {
-        return flat;
-    }
-    let bar = match fit_bar(points, p, a, options) {
-        Ok(bar) => bar,
-        Err(e) => return flat.map_err(|flat| if both { e } else { flat }),
-    };
-    let bar_scored = |noise: f64| {
-        let all: Vec<f64> = scaled(&bar.residuals, points, |_| true);
-        score(RimModel::RoundBar, truncated(&all, noise), bar.fit.parameters, all.len(), noise)
-    };
-    let Ok(flat) = flat else {
-        let result = bar_result(&bar, vec![bar_scored(bar.noise)], a, points, p, options);
-        // Neither: the plane's words are about the contours, the bar's only matter where it fits the points.
-        return match (flat, result) {
-            (_, Ok(r)) => Ok(r),
-            (_, Err(e @ Refusal::BarUndetermined { .. })) => Err(e),
-            (Err(e), Err(b)) => Err(if both { b } else { e }),
-            (Ok(r), Err(_)) => Ok(r),
-        };
-    };
-    // The hole of a flat ring is a rim of its own, with as many parameters again.
-    let hole = if both { analyse([&inner[0], &inner[1]], p, options).ok() } else { None };
-    let hole_fit = hole.as_ref().and_then(|h| choose_plane_model(h, RimChoice::Edge, options).ok());
-    let own = scaled(&flat.report.residuals, points, |o| o == Outline::Outer);
-    let parameters = |m: RimModel| if m == RimModel::Circle { 6 } else { 8 };
-    let (mut rest, mut more) = (own, parameters(flat.model));
-    if both {
-        match &hole_fit {
-            Some((f, _)) => {
-                more += f.parameters;
-                for k in 0..2 {
-                    let conic = image_conic(p[k], &f.rim);
-                    rest.extend(inner[k].iter().map(|q| distance(&conic, &q.uv) / q.sigma));
-                }
-            }
-            None => return bar_result(&bar, vec![bar_scored(bar.noise)], a, points, p, options),
-        }
-    }
-    let noise = bar.noise.min(flat.report.noise).max(1e-6);
-    let flat_score = score(flat.model, truncated(&rest, noise), more, rest.len(), noise);
-    let bar_score = bar_scored(noise);
-    let scores: Vec<Score> = flat.report.scores.iter().copied().chain([bar_score]).collect();
-    if bar_score.bic < flat_score.bic {
-        match bar_result(&bar, scores.clone(), a, points, p, options) {
-            Ok(r) => return Ok(r),
-            Err(e) if both => return Err(e),
-            Err(_) => {}
-        }
-    }
-    let mut flat = flat;
-    flat.report.scores = scores;
-    Ok(flat)
-}
-
-/// Residuals in units of sigma of the points whose outline is wanted.
-fn scaled(residuals: &[Vec<f64>; 2], points: [&[EdgePoint]; 2], wanted: impl Fn(Outline) -> bool) -> Vec<f64> {
-    let mut out = Vec::new();
-    for k in 0..2 {
-        out.extend(residuals[k].iter().zip(points[k]).filter(|(_, q)| wanted(q.outline)).map(|(r, q)| r / q.sigma));
-    }
-    out
-}
-
-/// Sum of squares with every residual cut off at the outlier gate, so that models with different outliers can be compared.
-fn truncated(r: &[f64], noise: f64) -> f64 {
-    let most = GATE * noise;
-    r.iter().map(|x| if x.is_finite() { (x * x).min(most * most) } else { most * most }).sum()
 }
 
 /// Chooses between circle and ellipse by the information criterion (or as told), and holds the winner against the task's tolerance.
