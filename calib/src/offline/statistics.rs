@@ -1,9 +1,9 @@
-//! STAT
+//! Robust statistics that several stages share.
 
-/// A median absolute deviation times this is a standard deviation for Gaussian noise.
+/// Ratio of the standard deviation to the median absolute deviation for Gaussian noise.
 pub(crate) const MAD: f64 = 1.482_602_218_505_602;
 
-/// Median; infinite for nothing. Not finite values count as infinite.
+/// Median of the values; infinite for an empty list. NaN and infinite values count as plus infinity.
 pub(crate) fn median(mut v: Vec<f64>) -> f64 {
     if v.is_empty() {
         return f64::INFINITY;

@@ -1,7 +1,7 @@
 //! Where a bar's outlines are in an image, and which edges there are likely to be theirs.
 
 use crate::offline::bar::torus::{Torus, outline};
-use crate::offline::contour::follow::{Place, places};
+use crate::offline::contour::follow::{CurvePoint, curve_points};
 use crate::offline::contour::{Contour, ContourPoint, ViewEdges};
 use crate::offline::rim::circle::frame_of;
 use crate::offline::statistics::median;
@@ -52,7 +52,11 @@ impl<'a, 'b> View<'a, 'b> {
     ///
     /// An outline is the sharpest step there is; a bar's shading makes softer ones of its own beside it, all the way round. So the strong edge wins, not the
     /// nearest.
-    pub(in crate::offline::bar) fn outline_edges(&self, places: &[Place], tolerance: f64) -> (f64, Vec<Option<u32>>) {
+    pub(in crate::offline::bar) fn outline_edges(
+        &self,
+        places: &[CurvePoint],
+        tolerance: f64,
+    ) -> (f64, Vec<Option<u32>>) {
         let (mut sum, mut seen, mut hits) = (0.0, 0usize, Vec::with_capacity(places.len()));
         for p in places {
             let raw = self.edges.lens.raw(p.at);
@@ -80,13 +84,13 @@ impl<'a, 'b> View<'a, 'b> {
     }
 
     /// Places along the outer and the inner outline where they are not hidden by the bar itself.
-    pub(in crate::offline::bar) fn outlines(&self, torus: &Torus, corners: usize, step: f64) -> [Vec<Place>; 2] {
+    pub(in crate::offline::bar) fn outlines(&self, torus: &Torus, corners: usize, step: f64) -> [Vec<CurvePoint>; 2] {
         let bar = Bar::new(torus, &self.eye);
         [0, 1].map(|k| self.places(&bar, k, corners, step))
     }
 
     /// The same along one of them: 0 is the outer one.
-    fn places(&self, bar: &Bar<'_>, which: usize, corners: usize, step: f64) -> Vec<Place> {
+    fn places(&self, bar: &Bar<'_>, which: usize, corners: usize, step: f64) -> Vec<CurvePoint> {
         let corner = |k: usize| {
             let angle = std::f64::consts::TAU * k as f64 / corners as f64;
             let x = *outline(bar.torus, bar.eye, angle)?.get(which)?;
@@ -94,7 +98,7 @@ impl<'a, 'b> View<'a, 'b> {
             (!bar.hides(&x, angle) && u.iter().all(|v| v.is_finite())).then_some(u)
         };
         let curve: Vec<Option<Pixel>> = (0..corners).map(corner).collect();
-        places(&curve, step, project(self.p, &bar.torus.centre))
+        curve_points(&curve, step, project(self.p, &bar.torus.centre))
     }
 }
 

@@ -6,7 +6,7 @@ use crate::offline::bar::outlines::{View, support};
 use crate::offline::bar::result::reconstruct_bar;
 use crate::offline::bar::torus::{Free, Ray, Torus, fit, rays};
 use crate::offline::contour::Contour;
-use crate::offline::contour::follow::{Finish, STEP_PX};
+use crate::offline::contour::follow::{RefineEdge, STEP_PX};
 use crate::offline::edges::Refined;
 use crate::offline::edges::separate::separate;
 use crate::offline::rim::model::Options;
@@ -173,7 +173,7 @@ fn followed(
             }
         };
         let inwards = |r: &Refined, out: Pixel| finish(r, -out);
-        let [away, into]: [&Finish<'_>; 2] = [&finish, &inwards];
+        let [away, into]: [&RefineEdge<'_>; 2] = [&finish, &inwards];
         let wanted = sharp != Sharp::No;
         Some([
             v.edges.follow(&outer, tolerance, wanted.then_some(away))?,

@@ -1,6 +1,7 @@
 //! Conics in one image: ellipse and matrix forms, the direct fit, and the geometric fit with its covariance.
 //!
-//! A conic is a symmetric 3x3 `C` with `u^T C u = 0`, oriented so that the outside is positive (signature + + -), unit Frobenius norm.
+//! A conic is a symmetric 3x3 matrix `C` with `u^T C u = 0`, oriented so that the outside is positive (signature + +
+//! -), with unit Frobenius norm.
 
 pub mod eigen;
 pub(in crate::offline) mod levenberg;
@@ -13,27 +14,27 @@ use crate::offline::types::{EdgePoint, Ellipse2, Scatter};
 use nalgebra::{Matrix2, Matrix3, Matrix5, SMatrix, SVector, Vector2, Vector3};
 use std::f64::consts::PI;
 
-/// Why points give no ellipse; [`crate::offline::rim::reconstruct`] adds the view.
+/// Why no ellipse fits the points. The caller adds the view.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum FitError {
     /// Fewer than five points.
-    #[error("{0} points, five are needed")]
+    #[error("{0} points, at least 5 are needed")]
     TooFew(usize),
-    /// A coordinate or sigma is not a finite number, or a sigma not positive.
-    #[error("a coordinate is not finite or a sigma not positive")]
+    /// A coordinate or sigma is not finite, or a sigma is not positive.
+    #[error("a coordinate is not finite, or a sigma is not positive")]
     NotFinite,
-    /// All points on a line (or in one place).
+    /// All points lie on a line or coincide.
     #[error("the points are collinear")]
     Collinear,
     /// The best conic is not a real ellipse.
     #[error("the points do not lie on an ellipse")]
     NotAnEllipse,
-    /// The ellipse is not determined: relative standard deviation of a semi-axis.
-    #[error("the arc is too short: a semi-axis is known to {0:.2} of itself")]
+    /// The ellipse is not determined; carries the relative standard deviation of a semi-axis.
+    #[error("the arc is too short: the relative standard deviation of a semi-axis is {0:.2}")]
     ArcTooShort(f64),
 }
 
-/// Largest relative standard deviation of a semi-axis that a fit may have before its arc counts as too short.
+/// Largest relative standard deviation of a semi-axis. A fit beyond it has too short an arc.
 pub const MAX_RELATIVE_AXIS_SIGMA: f64 = 0.25;
 
 /// An ellipse fitted to the edge points of one view.
@@ -41,7 +42,7 @@ pub const MAX_RELATIVE_AXIS_SIGMA: f64 = 0.25;
 pub struct EllipseFit {
     /// The oriented conic in pixels.
     pub conic: Matrix3<f64>,
-    /// The same as an ellipse.
+    /// The same conic as an ellipse.
     pub ellipse: Ellipse2,
     /// Standard deviation of the residuals: pixels when all sigmas are 1, otherwise in units of the given sigma.
     pub noise: f64,
@@ -49,14 +50,14 @@ pub struct EllipseFit {
     pub chi2: f64,
     /// Number of points.
     pub count: usize,
-    /// Chart at the solution: the shape `S` (pixels) with conic of `{centre + S (cos t, sin t)}`.
+    /// Chart at the solution: the shape `S` (pixels) of the ellipse `{centre + S (cos t, sin t)}`.
     pub shape: Matrix2<f64>,
     /// Inverse normal matrix of `(centre x, y, S00, S01, S11)`, pixels squared for unit noise: times `noise^2` it is the covariance.
     pub cofactor: Matrix5<f64>,
 }
 
 impl EllipseFit {
-    /// Covariance of `(xc, yc, a, b, theta)`; the angle is not determined when `a = b`.
+    /// Covariance of `(xc, yc, a, b, theta)`; the angle is undetermined when `a = b`.
     pub fn covariance(&self) -> Matrix5<f64> {
         let (w, v) = eigen::symmetric(&self.shape);
         let mut g = SMatrix::<f64, 5, 5>::zeros();
@@ -75,7 +76,7 @@ impl EllipseFit {
         g * self.cofactor * g.transpose() * (self.noise * self.noise)
     }
 
-    /// Conics one standard deviation of the chart's parameter `k` to either side (unit noise): for propagating through anything.
+    /// The conic with the chart's parameter `k` changed by `step`, for numerical propagation of the covariance.
     pub fn perturbed(&self, k: usize, step: f64) -> Matrix3<f64> {
         let mut c = self.ellipse.centre;
         let mut s = self.shape;
@@ -93,7 +94,7 @@ impl EllipseFit {
     }
 }
 
-/// Symmetrises, scales to unit Frobenius norm, and turns the sign so that more eigenvalues are positive than negative.
+/// Symmetrises, scales to unit Frobenius norm, and chooses the sign with more positive than negative eigenvalues.
 pub fn orient<const N: usize>(c: &SMatrix<f64, N, N>) -> SMatrix<f64, N, N> {
     let c = (c + c.transpose()) * 0.5;
     let c = c / c.norm();
@@ -153,7 +154,8 @@ pub fn adjugate(m: &Matrix3<f64>) -> Matrix3<f64> {
     Matrix3::from_rows(&[b.cross(&c).transpose(), c.cross(&a).transpose(), a.cross(&b).transpose()])
 }
 
-/// Checks coordinates, count and collinearity; returns centroid and scale (root mean square distance over sqrt 2) of the points.
+/// Checks coordinates, count and collinearity. Returns the centroid and the scale (root mean square distance over sqrt
+/// 2) of the points.
 fn frame_of_points(points: &[EdgePoint]) -> Result<(Vector2<f64>, f64), FitError> {
     if points.iter().any(|p| !(p.uv.x.is_finite() && p.uv.y.is_finite() && p.sigma.is_finite() && p.sigma > 0.0)) {
         return Err(FitError::NotFinite);
@@ -169,17 +171,22 @@ fn frame_of_points(points: &[EdgePoint]) -> Result<(Vector2<f64>, f64), FitError
         scatter += d * d.transpose();
     }
     let (w, _) = eigen::symmetric(&scatter);
-    // The condition of the reference (1e12 on the scatter of normalised points) in the form of a ratio of standard deviations, 1e-6.
+    // A ratio of standard deviations of 1e-6, which equals the reference's condition number of 1e12 on normalised
+    // scatter.
     if !(w[1] > 0.0) || !w[1].is_finite() || w[0] < 1e-12 * w[1] {
         return Err(FitError::Collinear);
     }
     Ok((mean, ((w[0] + w[1]) / n * 0.5).sqrt()))
 }
 
-/// Direct least squares (Fitzgibbon in the form of Halir and Flusser) on normalised points: an ellipse whenever one exists.
+/// Direct least squares (Fitzgibbon, in the form of Halir and Flusser) on normalised points: an ellipse whenever one
+/// exists.
 ///
-/// The constrained problem `S a = lambda B a` with the indefinite `B` of `4ac - b^2` is solved as the symmetric one
-/// `L^-1 B L^-T`, `S = L L^T`, whose one positive eigenvalue belongs to the ellipse.
+/// The constrained problem `S a = lambda B a` with the indefinite `B` of `4ac - b^2` is solved as the symmetric
+/// problem `L^-1 B L^-T`, `S = L L^T`, whose only positive eigenvalue belongs to the ellipse.
+///
+/// # Errors
+/// [`FitError`] when points are missing, not finite or collinear, or their best conic is not an ellipse.
 pub fn fit_direct(points: &[EdgePoint]) -> Result<Matrix3<f64>, FitError> {
     let (mean, scale) = frame_of_points(points)?;
     let mut s1 = Matrix3::zeros();
@@ -198,10 +205,10 @@ pub fn fit_direct(points: &[EdgePoint]) -> Result<Matrix3<f64>, FitError> {
     let k = -(inverse * s2.transpose());
     let reduced = s1 + s2 * k;
     let reduced = (reduced + reduced.transpose()) * 0.5;
-    // Exact points make the reduced scatter singular; this lift is far below the rounding of the data.
-    let lift = Matrix3::identity() * (reduced.trace().abs().max(s1.trace() * 1e-3) * 1e-15);
-    let l = eigen::cholesky(&(reduced + lift), 3)
-        .or_else(|| eigen::cholesky(&(reduced + lift * 100.0), 3))
+    // Exact points make the reduced scatter singular; this ridge is far below the rounding of the data.
+    let ridge = Matrix3::identity() * (reduced.trace().abs().max(s1.trace() * 1e-3) * 1e-15);
+    let l = eigen::cholesky(&(reduced + ridge), 3)
+        .or_else(|| eigen::cholesky(&(reduced + ridge * 100.0), 3))
         .ok_or(FitError::NotAnEllipse)?;
     let li = lower_inverse(&l);
     let b = Matrix3::new(0.0, 0.0, 2.0, 0.0, -1.0, 0.0, 2.0, 0.0, 0.0);
@@ -214,7 +221,7 @@ pub fn fit_direct(points: &[EdgePoint]) -> Result<Matrix3<f64>, FitError> {
     let c =
         Matrix3::new(a1[0], a1[1] / 2.0, a2[0] / 2.0, a1[1] / 2.0, a1[2], a2[1] / 2.0, a2[0] / 2.0, a2[1] / 2.0, a2[2]);
     let t = Matrix3::new(1.0 / scale, 0.0, -mean.x / scale, 0.0, 1.0 / scale, -mean.y / scale, 0.0, 0.0, 1.0);
-    // Real and finite in its own frame; the pixel matrix is only a change of variables.
+    // The check is done in the normalised frame: the pixel matrix is only a change of variables.
     ellipse_of(&c).ok_or(FitError::NotAnEllipse)?;
     Ok(orient(&(t.transpose() * c * t)))
 }
@@ -246,7 +253,7 @@ impl Shape2 {
         Matrix3::new(s[(0, 0)], s[(0, 1)], c.x, s[(1, 0)], s[(1, 1)], c.y, 0.0, 0.0, 1.0)
     }
 
-    /// Unit-scale conic with `det` taken out, or `None` where the shape has collapsed.
+    /// The conic and `M^-1`; `None` where the shape is singular.
     fn conic(&self) -> Option<(Matrix3<f64>, Matrix3<f64>)> {
         let m = self.matrix();
         let i = m.try_inverse()?;
@@ -308,13 +315,16 @@ impl Problem<5> for OneView<'_> {
 
 /// Refines the direct fit to the minimum of the summed squared Sampson distances, with covariance.
 ///
-/// Sampson distances have zero mean to second order under isotropic noise (literature-conics), so this is the maximum-likelihood fit.
+/// Sampson distances have zero mean to second order under isotropic noise, so that this is the maximum-likelihood fit.
+///
+/// # Errors
+/// [`FitError`] as [`fit_direct`], and when the arc is too short.
 pub fn fit_ml(points: &[EdgePoint], scatter: Scatter) -> Result<EllipseFit, FitError> {
     let start = fit_direct(points)?;
     refine(points, &start, scatter)
 }
 
-/// The geometric fit from a given start.
+/// The geometric fit from a given start (see [`fit_ml`]).
 pub fn refine(points: &[EdgePoint], start: &Matrix3<f64>, scatter: Scatter) -> Result<EllipseFit, FitError> {
     let e = ellipse_of(start).ok_or(FitError::NotAnEllipse)?;
     let cloud = Cloud::new(points, None, e.centre, e.a, scatter);
@@ -359,7 +369,7 @@ mod tests {
     }
 
     #[test]
-    fn matrix_and_ellipse_are_inverse_of_each_other() {
+    fn matrix_and_ellipse_conversions_are_inverse() {
         let e = ellipse_of(&(conic_of(&some()) * -3.0)).unwrap();
         assert!((e.centre - some().centre).norm() < 1e-9 && (e.a - 71.0).abs() < 1e-9 && (e.theta - 1.2).abs() < 1e-10);
         assert!(ellipse_of(&Matrix3::from_diagonal(&Vector3::new(1.0, -1.0, -1.0))).is_none());
@@ -391,7 +401,7 @@ mod tests {
             .map(|i| f64::from(i) * 0.2)
             .map(|t| EdgePoint::new(90.0 * t.cosh(), 60.0 * t.sinh(), 1.0))
             .collect();
-        // The direct fit always finds some ellipse; its residuals give it away.
+        // The direct fit always finds an ellipse; its residuals reveal that it is wrong.
         assert!(fit_ml(&hyperbola, Scatter::Isotropic).map_or(true, |f| f.noise > 20.0));
         let nan = vec![EdgePoint::new(f64::NAN, 0.0, 1.0); 9];
         assert_eq!(fit_ml(&nan, Scatter::Isotropic).unwrap_err(), FitError::NotFinite);

@@ -1,4 +1,4 @@
-//! GATHER
+//! From a trial ellipse to a contour: edges by consensus, thinned and refined.
 
 use crate::offline::contour::grow::Trial;
 use crate::offline::contour::one_ellipse::{
@@ -9,12 +9,14 @@ use crate::offline::contour::view_edges::ViewEdges;
 use crate::offline::types::{EdgePoint, Ellipse2, Outline};
 
 impl ViewEdges<'_> {
-    /// The contour of a trial: edges by consensus, thinned, refined, with their ellipse. `None` when too little is left.
+    /// The contour of a trial ellipse: edges by consensus, thinned, refined, with their ellipse. `None` when too few
+    /// remain.
     pub(in crate::offline) fn contour(&self, trial: &Trial) -> Option<Contour> {
         let sign = if trial.bright_inside { -1.0 } else { 1.0 };
         let mut e = trial.ellipse;
         let band = self.band(&e, sign);
-        // Consensus: from a wide band to one of a few standard deviations, by the median so that half of them may be wrong.
+        // Consensus: the band narrows from 2.5 px to a few standard deviations, estimated by the median, so that up to
+        // half of the edges may be outliers.
         let mut width = 2.5;
         for _ in 0..8 {
             let w = Walk::new(&e);
@@ -42,7 +44,7 @@ impl ViewEdges<'_> {
         self.refined(&e, sign, &band, width)
     }
 
-    /// Edges near an ellipse, of any distance up to four pixels, in raster order.
+    /// Edges within four pixels of an ellipse, in raster order.
     fn band(&self, e: &Ellipse2, sign: f64) -> Vec<u32> {
         let w = Walk::new(e);
         let mut band: Vec<u32> = Vec::new();
@@ -64,7 +66,7 @@ impl ViewEdges<'_> {
         let e = *start;
         let w = Walk::new(&e);
         let bins = ((w.perimeter() / INDEPENDENT_PX) as usize).clamp(12, 4000);
-        // In each bin the edge nearest its middle, so that the points stand apart.
+        // In each bin the edge nearest its middle, so that the points are spaced apart.
         let mut chosen: Vec<Option<(f64, u32)>> = vec![None; bins];
         let at_bin = bin_of(&w, bins);
         let mut rejected = Vec::new();
@@ -79,9 +81,9 @@ impl ViewEdges<'_> {
                 }
                 continue;
             }
-            let place = at_bin(t);
-            let off = (place.fract() - 0.5).abs();
-            if let Some(slot) = chosen.get_mut((place as usize).min(bins - 1)) {
+            let bin = at_bin(t);
+            let off = (bin.fract() - 0.5).abs();
+            if let Some(slot) = chosen.get_mut((bin as usize).min(bins - 1)) {
                 if slot.is_none_or(|(o, _)| off < o) {
                     *slot = Some((off, *k));
                 }
@@ -92,7 +94,7 @@ impl ViewEdges<'_> {
             let Some(r) = self.refine(*k) else { continue };
             let Some(ideal) = self.lens.ideal(r.at) else { continue };
             let (_, n, t) = w.measure(ideal);
-            // Lens distortion turns the normal by far less than matters for a shift of hundredths of a pixel.
+            // The rotation of the normal by lens distortion is negligible for a shift of hundredths of a pixel.
             let r = r.straightened(n, w.radius(t));
             let Some(ideal) = self.lens.ideal(r.at) else { continue };
             let sigma = r.sigma.hypot(FLOOR_PX);

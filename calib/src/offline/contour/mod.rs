@@ -1,8 +1,12 @@
-//! A contour: the edge points of one ellipse, gathered through gaps, spokes and occlusions.
+//! A contour: the edge points of one ellipse, collected across gaps, spokes and occlusions.
 //!
-//! A seed edge and its arc are tried alone and with every other arc of the image that could lie on the same convex curve with the same brighter side;
-//! each trial ellipse is judged by how much of it carries edges of the right direction. The best few are fitted again to the edges they gathered until
-//! they stop changing, then the edges in a narrow band are taken by consensus, thinned to independent ones and refined.
+//! A seed edge and its arc are tried alone and together with every other arc of the image that could lie on the same
+//! convex curve with the same side brighter ([`ViewEdges::trials`]). Each trial ellipse is scored by the fraction of
+//! it that carries edges of the right direction. The best few are fitted again to their own edges until they stop
+//! changing. The edges in a narrow band are then selected by consensus, thinned to independent ones and refined.
+//!
+//! [`select`] turns an operator's selection into candidate contours; `follow` collects edges along a curve that a
+//! model predicts.
 
 mod directions;
 pub(in crate::offline) mod follow;
@@ -17,5 +21,5 @@ mod view_edges;
 
 pub(in crate::offline) use one_ellipse::alike;
 pub use one_ellipse::{Contour, ContourPoint};
-pub(in crate::offline) use separated::told_apart;
+pub(in crate::offline) use separated::separate_pair;
 pub use view_edges::ViewEdges;

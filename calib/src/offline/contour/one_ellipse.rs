@@ -1,28 +1,31 @@
-//! ONE
+//! The contour type, and the fit of one ellipse to refined edge points.
 
 use crate::offline::contour::quick_fit::{Sums, Walk};
 use crate::offline::types::{EdgePoint, Ellipse2, Outline};
 use graspd_rt::geom::Pixel;
 
-/// Edges closer together than this share most of their pixels (2 sqrt(pi) times the smoothing), so that they count as one.
+/// Edges closer together than this share most of their pixels (2 sqrt(pi) times the smoothing), and count as one,
+/// pixels.
 pub(in crate::offline) const INDEPENDENT_PX: f64 = 3.5;
-/// Uncertainty of an edge that no pixel noise explains: lens residue, detector non-uniformity, the rim's own roughness.
+/// Uncertainty of an edge that pixel noise does not explain, pixels: residual lens distortion, detector
+/// non-uniformity, roughness of the rim.
 pub(in crate::offline) const FLOOR_PX: f64 = 0.03;
-/// Edges that scatter more about their ellipse belong to several contours. A round bar's outline, which is none, stays below half of it.
-const MOST_SCATTER_PX: f64 = 0.9;
-/// Smallest part of an ellipse that has to carry edges.
-pub(in crate::offline) const LEAST_COVERAGE: f64 = 0.25;
+/// Largest root mean square distance of a contour's edges from their ellipse, pixels: more, and they belong to several
+/// contours. The outline of a round bar, which is not an ellipse, stays below half of it.
+const MAX_SCATTER_PX: f64 = 0.9;
+/// Smallest fraction of an ellipse that has to carry edges.
+pub(in crate::offline) const MIN_COVERAGE: f64 = 0.25;
 
 /// An edge point of a contour.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ContourPoint {
-    /// Where it is in the image.
+    /// Position in the image, raw pixels.
     pub raw: Pixel,
-    /// The same without lens distortion, with its standard deviation.
+    /// The same in ideal pixels, with its standard deviation.
     pub edge: EdgePoint,
     /// Signed distance from the ellipse, ideal pixels, positive outside.
     pub residual: f64,
-    /// Parameter of the place on the ellipse, radians.
+    /// Parameter of the point on the ellipse, radians.
     pub parameter: f64,
 }
 
@@ -33,13 +36,13 @@ pub struct Contour {
     pub ellipse: Ellipse2,
     /// Whether the inside is the brighter side.
     pub bright_inside: bool,
-    /// The edge points that lie on it, in order round it.
+    /// The edge points on the ellipse, ordered by parameter.
     pub points: Vec<ContourPoint>,
-    /// Edges of the right direction near it that do not (raw pixels).
+    /// Edges near the ellipse with the right direction that do not lie on it, raw pixels.
     pub rejected: Vec<Pixel>,
-    /// Part of the ellipse that carries edge points.
+    /// Fraction of the ellipse that carries edge points.
     pub coverage: f64,
-    /// Root mean square distance of the points, pixels.
+    /// Root mean square distance of the points from the ellipse, pixels.
     pub rms_px: f64,
 }
 
@@ -50,18 +53,19 @@ impl Contour {
         (self.points.iter().map(|p| p.edge.sigma * p.edge.sigma).sum::<f64>() / n).sqrt()
     }
 
-    /// Distance of a raw pixel from the nearest edge point.
+    /// Distance of a raw pixel from the nearest edge point, pixels.
     pub fn distance(&self, raw: Pixel) -> f64 {
         self.points.iter().map(|p| (p.raw - raw).norm()).fold(f64::INFINITY, f64::min)
     }
 
-    /// The edge points as the reconstruction takes them.
+    /// The edge points as input of the reconstruction, labelled with an outline.
     pub fn edge_points(&self, outline: Outline) -> Vec<EdgePoint> {
         self.points.iter().map(|p| EdgePoint { outline, ..p.edge }).collect()
     }
 }
 
-/// Fits the ellipse to refined points, drops those that do not lie on it, and puts the rest in order.
+/// Fits an ellipse to refined points, rejects the points off it, and orders the rest. `None` when too few points or
+/// too little of the ellipse remain.
 pub(super) fn points_on_one_ellipse(
     mut points: Vec<ContourPoint>,
     mut e: Ellipse2,
@@ -112,11 +116,11 @@ pub(super) fn points_on_one_ellipse(
     let rms_px = (points.iter().map(|p| p.residual * p.residual).sum::<f64>() / n).sqrt();
     let coverage = (n / bins as f64).min(1.0);
     rejected.sort_by(|a, b| a.y.total_cmp(&b.y).then(a.x.total_cmp(&b.x)));
-    let good = coverage >= LEAST_COVERAGE && rms_px <= MOST_SCATTER_PX;
+    let good = coverage >= MIN_COVERAGE && rms_px <= MAX_SCATTER_PX;
     good.then_some(Contour { ellipse: e, bright_inside, points, rejected, coverage, rms_px })
 }
 
-/// Place along an ellipse in bins of equal arc length.
+/// Maps a parameter of an ellipse to its arc length in bins of equal length.
 pub(super) fn bin_of(w: &Walk, bins: usize) -> impl Fn(f64) -> f64 {
     const FINE: usize = 720;
     let dt = std::f64::consts::TAU / FINE as f64;

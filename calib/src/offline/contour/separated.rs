@@ -1,36 +1,36 @@
-//! SEP
+//! Contours whose edges are separated from overlapping neighbours.
 
 use crate::offline::contour::one_ellipse::{Contour, ContourPoint, FLOOR_PX, INDEPENDENT_PX, points_on_one_ellipse};
 use crate::offline::contour::quick_fit::Walk;
-use crate::offline::contour::view_edges::{Sharpened, ViewEdges};
+use crate::offline::contour::view_edges::{Separation, ViewEdges};
 use crate::offline::edges::Refined;
 use crate::offline::edges::separate::separate;
 use crate::offline::statistics::median;
 use crate::offline::types::{EdgePoint, Outline};
 
-/// Contours that are remembered: a selection has a handful of candidates, and the next one has others.
-const MOST_KEPT: usize = 16;
-/// Edges told apart from their neighbours have to scatter by this much more than before, and by this much more than they say, for the telling apart to be
-/// taken for the cause.
-const SCATTERED_BY: f64 = 1.4;
-const BEYOND: f64 = 2.0;
+/// Largest number of cached contours: a selection has a handful of candidates, and the next selection has others.
+const MAX_CACHED: usize = 16;
+/// Separated edges that scatter by more than this factor over the detected ones are degraded by the separation.
+const MAX_SCATTER_GROWTH: f64 = 1.4;
+/// The same limit in their own standard deviations: both have to be exceeded.
+const MAX_SCATTER_SIGMAS: f64 = 2.0;
 
 impl ViewEdges<'_> {
-    /// What becomes of a contour when every edge is told apart from its neighbours (see [`crate::offline::edges::sharpen`]).
-    fn sharpened(&self, c: &Contour) -> Sharpened {
-        if let Some((_, known)) = self.sharp.borrow().iter().find(|(from, _)| from == c) {
+    /// Separates every edge of a contour from its neighbours (see [`crate::offline::edges::separate`]); cached.
+    fn separation(&self, c: &Contour) -> Separation {
+        if let Some((_, known)) = self.separations.borrow().iter().find(|(from, _)| from == c) {
             return known.clone();
         }
-        let sharp = self.separate(c);
-        let mut known = self.sharp.borrow_mut();
-        if known.len() >= MOST_KEPT {
+        let separated = self.separate(c);
+        let mut known = self.separations.borrow_mut();
+        if known.len() >= MAX_CACHED {
             known.remove(0);
         }
-        known.push((c.clone(), sharp.clone()));
-        sharp
+        known.push((c.clone(), separated.clone()));
+        separated
     }
 
-    fn separate(&self, c: &Contour) -> Sharpened {
+    fn separate(&self, c: &Contour) -> Separation {
         let blur = self.blur();
         let w = Walk::new(&c.ellipse);
         let sign = if c.bright_inside { -1.0 } else { 1.0 };
@@ -38,7 +38,7 @@ impl ViewEdges<'_> {
         let mut rejected = c.rejected.clone();
         for p in &c.points {
             let (_, n, t) = w.measure(p.edge.uv);
-            // The ellipse knows the direction of the edge better than one pixel's gradient does.
+            // The ellipse determines the direction of the edge better than the gradient at one pixel.
             let ahead = self.lens.raw(p.edge.uv + n * 0.5) - self.lens.raw(p.edge.uv - n * 0.5);
             let Some(towards_bright) = (ahead * sign).try_normalize(1e-9) else { continue };
             let start = Refined { at: p.raw, towards_bright, sigma: p.edge.sigma, width: 1.0 };
@@ -53,30 +53,32 @@ impl ViewEdges<'_> {
             }
         }
         if points.len() * 2 < c.points.len() {
-            return Sharpened::TooFew;
+            return Separation::TooFew;
         }
         let bins = ((w.perimeter() / INDEPENDENT_PX) as usize).clamp(12, 4000);
-        let Some(sharp) = points_on_one_ellipse(points, c.ellipse, c.bright_inside, bins, rejected) else {
-            return Sharpened::TooFew;
+        let Some(separated) = points_on_one_ellipse(points, c.ellipse, c.bright_inside, bins, rejected) else {
+            return Separation::TooFew;
         };
-        // Where edges are no blurred steps (a real lens, texture beside the rim, an image that was sharpened or compressed) taking them apart scatters them, by
-        // more than it says. What it moves them by is then doubt, and no correction.
-        let says = median(sharp.points.iter().map(|p| p.edge.sigma).collect());
-        if sharp.rms_px > SCATTERED_BY * c.rms_px && sharp.rms_px > BEYOND * says {
-            return Sharpened::Scattered(sharp.rms_px);
+        // Where edges are not blurred steps (a real lens, texture beside the rim, a sharpened or compressed image),
+        // the separation scatters them by more than its standard deviation. Their displacement is then an uncertainty,
+        // not a correction.
+        let stated = median(separated.points.iter().map(|p| p.edge.sigma).collect());
+        if separated.rms_px > MAX_SCATTER_GROWTH * c.rms_px && separated.rms_px > MAX_SCATTER_SIGMAS * stated {
+            return Separation::Scattered(separated.rms_px);
         }
-        Sharpened::Apart(sharp)
+        Separation::Separated(separated)
     }
 }
 
-/// Two views' images of one contour with every edge told apart from its neighbours, where that can be done.
+/// Two views' images of one contour, with edges separated from their neighbours where that is possible.
 ///
-/// What scatters the edges of one view would do so in the other, only less visibly, and what neighbours move edges by is much the same in both: it leaves the depth
-/// alone as long as both views keep it. So both are told apart, or neither.
-pub(in crate::offline) fn told_apart(views: [&ViewEdges<'_>; 2], clicked: [&Contour; 2]) -> [Contour; 2] {
-    let sharp = [views[0].sharpened(clicked[0]), views[1].sharpened(clicked[1])];
-    let scatter = sharp.iter().filter_map(|s| match s {
-        Sharpened::Scattered(rms_px) => Some(*rms_px),
+/// Degradation in one view exists in the other as well, only less visibly. The displacement by neighbours is nearly
+/// the same in both views, so that it cancels in the depth as long as both views keep it. Therefore both contours are
+/// separated, or neither.
+pub(in crate::offline) fn separate_pair(views: [&ViewEdges<'_>; 2], clicked: [&Contour; 2]) -> [Contour; 2] {
+    let separated = [views[0].separation(clicked[0]), views[1].separation(clicked[1])];
+    let scatter = separated.iter().filter_map(|s| match s {
+        Separation::Scattered(rms_px) => Some(*rms_px),
         _ => None,
     });
     if let Some(rms_px) = scatter.reduce(f64::max) {
@@ -86,7 +88,7 @@ pub(in crate::offline) fn told_apart(views: [&ViewEdges<'_>; 2], clicked: [&Cont
             plain
         });
     }
-    let [left, right] = sharp;
-    let one = |s: Sharpened, c: &Contour| if let Sharpened::Apart(sharp) = s { sharp } else { c.clone() };
+    let [left, right] = separated;
+    let one = |s: Separation, c: &Contour| if let Separation::Separated(separated) = s { separated } else { c.clone() };
     [one(left, clicked[0]), one(right, clicked[1])]
 }

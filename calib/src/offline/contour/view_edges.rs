@@ -1,4 +1,4 @@
-//! VIEW
+//! The edges of one view with the data that growing contours needs.
 
 use crate::offline::contour::directions::Directions;
 use crate::offline::contour::one_ellipse::Contour;
@@ -12,10 +12,10 @@ use graspd_rt::geom::{Camera, Pixel};
 use std::cell::{OnceCell, RefCell};
 use std::collections::HashMap;
 
-/// Places at which a trial ellipse is judged at most.
-const MOST_PLACES: usize = 160;
+/// Largest number of points at which a trial ellipse is scored.
+const MAX_POINTS: usize = 160;
 
-/// An image with everything that contours are grown from.
+/// An image with its edge points, arcs and caches for growing contours.
 #[derive(Clone, Debug)]
 pub struct ViewEdges<'a> {
     /// The image.
@@ -28,27 +28,28 @@ pub struct ViewEdges<'a> {
     pub lens: Lens,
     /// Up to 16 edges of each arc, evenly spaced.
     pub(super) samples: Vec<Vec<u32>>,
-    /// Arcs by falling length.
+    /// Arc indices, longest first.
     pub(super) longest: Vec<u32>,
     blur: OnceCell<f64>,
-    /// Sines and cosines for walking round trial ellipses.
+    /// Sines and cosines for walking around trial ellipses.
     pub(super) turns: Turns,
-    /// Where edges of which directions are, for trial ellipses.
+    /// Look-up of edge directions near each pixel, for trial ellipses.
     pub(super) directions: Directions,
-    /// Edges brought to their place, by index: contours that compete share most of theirs.
+    /// Refined edges by index: competing contours share most of theirs.
     refined: RefCell<HashMap<u32, Option<Refined>>>,
-    /// Contours with what became of them when their edges were told apart: each is paired with several of the other view.
-    pub(super) sharp: RefCell<Vec<(Contour, Sharpened)>>,
+    /// Contours with the result of separating their edges from neighbours: each contour is paired with several of the
+    /// other view.
+    pub(super) separations: RefCell<Vec<(Contour, Separation)>>,
 }
 
-/// What became of a contour when its edges were told apart from their neighbours.
+/// Result of separating a contour's edges from their neighbours.
 #[derive(Clone, Debug)]
-pub(super) enum Sharpened {
-    /// They could be.
-    Apart(Contour),
-    /// Too few of them could be.
+pub(super) enum Separation {
+    /// The contour with separated edges.
+    Separated(Contour),
+    /// Too few edges could be separated.
     TooFew,
-    /// They scatter by more than they say: root mean square, pixels.
+    /// The separated edges scatter by more than their standard deviations: root mean square, pixels.
     Scattered(f64),
 }
 
@@ -69,13 +70,25 @@ impl<'a> ViewEdges<'a> {
             .collect();
         let mut longest: Vec<u32> = (0..arcs.arcs.len() as u32).collect();
         longest.sort_by_key(|k| std::cmp::Reverse(arcs.arcs.get(*k as usize).map_or(0, |a| a.edges.len())));
-        let turns = Turns::new(MOST_PLACES);
+        let turns = Turns::new(MAX_POINTS);
         let directions = Directions::new(map.width(), map.height());
-        let (refined, sharp) = (RefCell::default(), RefCell::default());
-        Self { image, map, arcs, lens, samples, longest, blur: OnceCell::new(), turns, directions, refined, sharp }
+        let (refined, separations) = (RefCell::default(), RefCell::default());
+        Self {
+            image,
+            map,
+            arcs,
+            lens,
+            samples,
+            longest,
+            blur: OnceCell::new(),
+            turns,
+            directions,
+            refined,
+            separations,
+        }
     }
 
-    /// An edge point brought to its place (see [`edges::refine`]), once.
+    /// A refined edge point (see [`edges::refine()`]), computed once.
     pub(in crate::offline) fn refine(&self, k: u32) -> Option<Refined> {
         if let Some(known) = self.refined.borrow().get(&k) {
             return *known;
@@ -85,12 +98,12 @@ impl<'a> ViewEdges<'a> {
         r
     }
 
-    /// Standard deviation of a sharp edge's image, pixels; measured once.
+    /// Standard deviation of a separations edge's image, pixels; measured once.
     pub(in crate::offline) fn blur(&self) -> f64 {
         *self.blur.get_or_init(|| lens_blur(self.image, &self.map))
     }
 
-    /// Whether an edge in reach of a raw pixel may have this direction; see [`Directions::may_have_edge`].
+    /// Whether an edge near a raw pixel may have this direction; see [`Directions::may_have_edge`].
     pub(super) fn may_have_edge(&self, raw: Pixel, towards_bright: Pixel) -> bool {
         self.directions.may_have_edge((&self.map, &self.arcs.ideal), raw, towards_bright)
     }

@@ -1,4 +1,4 @@
-//! FIT
+//! The fit of a rig's error to matches: redescending Gauss-Newton, then a mixture over the quality of the rig.
 
 use crate::offline::correspondence::epipolar::{Match, epipolar_distance, fundamental};
 use crate::offline::correspondence::rig_prior::{PARAMETERS, Phi, RigPrior};
@@ -6,21 +6,21 @@ use crate::offline::edges::lens::projection;
 use graspd_rt::geom::{Rig, View};
 use nalgebra::SMatrix;
 
-/// Qualities of a rig that are weighed, as scales of the prior: from one as good as a pixel allows to one as bad as
+/// Qualities of a rig that are compared, as scales of the prior: from a rig as good as a pixel allows to one as bad as
 /// stated.
 const QUALITIES: [f64; 6] = [0.03, 0.06, 0.12, 0.25, 0.5, 1.0];
-/// Scatters of right matches across their lines that are weighed, pixels: patches of a clean image, of a blurred or
-/// compressed one.
+/// Scatters of correct matches across their lines that are compared, pixels: patches of a clean, and of a blurred or
+/// compressed image.
 const SCATTERS_PX: [f64; 3] = [0.1, 0.2, 0.4];
-/// Weight of a match: spots come in groups that see one edge or one occlusion and are off together, so that two count
-/// as one.
+/// Weight of a match: spots come in groups that share one edge or one occlusion and its error, so that two count as
+/// one.
 const WEIGHT: f64 = 0.5;
-/// Part of the matches that is false beforehand.
-const FALSE: f64 = 0.5;
-/// A false match lies anywhere within so many pixels across its line: as far as the search climbs.
+/// Prior probability that a match is false.
+const P_FALSE: f64 = 0.5;
+/// Range across its line over which a false match is uniform, pixels: the reach of the search.
 pub(super) const SPREAD_PX: f64 = 16.0;
-/// Least standard deviation of a match, pixels: patches are not seen from the same side by both cameras.
-const LEAST_SIGMA_PX: f64 = 0.1;
+/// Smallest standard deviation of a match, pixels: the cameras do not see a patch from the same direction.
+const MIN_SIGMA_PX: f64 = 0.1;
 
 /// Distances of matches from their epipolar lines, as functions of the rig's error.
 pub(super) struct Epipolar<'a> {
@@ -34,7 +34,7 @@ impl<'a> Epipolar<'a> {
         Self { rig, prior, matches }
     }
 
-    /// Signed distance of each right place from the left one's epipolar line, pixels.
+    /// Signed distance of each right point from the epipolar line of the left one, pixels.
     pub(super) fn residuals(&self, phi: &Phi) -> Vec<f64> {
         let rig = self.prior.corrected(self.rig, phi);
         let Some(f) = fundamental(&View::BOTH.map(|v| projection(&rig, v))) else {
@@ -59,13 +59,13 @@ impl<'a> Epipolar<'a> {
 
     /// Mean and covariance of the error when the quality of the rig is itself unknown.
     ///
-    /// The prior says how bad a rig may be; how good this one is, its visible part says: one calibration made all of
-    /// it, so that a rig whose epipolar lines fit ten times better than the prior expects is ten times better in what
-    /// cannot be seen. With the quality `q` as the scale of the prior, the evidence of the matches follows by
-    /// Laplace's method; the answer is the mixture over [`QUALITIES`], each as likely as the other beforehand.
+    /// The prior states how bad a rig may be. The observable part of the error shows how good this rig is: all of it
+    /// comes from one calibration, so that a rig whose epipolar lines fit ten times better than the prior expects is
+    /// ten times better in its unobservable part. With the quality `q` as the scale of the prior, the evidence of the
+    /// matches follows by Laplace's method. The result is the mixture over [`QUALITIES`], all equally likely a priori.
     pub(super) fn by_quality(&self, start: &Phi) -> Option<Mixture> {
         let (r, j) = (self.residuals(start), self.slopes(start));
-        // Linear in the error from here on.
+        // The model is linear in the error from here on.
         let rows: Vec<Row> = r
             .iter()
             .zip(&j)
@@ -83,14 +83,14 @@ impl<'a> Epipolar<'a> {
         }
         let most = each.iter().map(|e| e.0).fold(f64::NEG_INFINITY, f64::max);
         let total: f64 = each.iter().map(|e| (e.0 - most).exp()).sum();
-        let exact: f64 = SCATTERS_PX.iter().map(|s| (right_or_false(&rows, &Phi::zeros(), *s) - most).exp()).sum();
+        let exact: f64 = SCATTERS_PX.iter().map(|s| (log_likelihood(&rows, &Phi::zeros(), *s) - most).exp()).sum();
         let log_odds = exact.ln() - (total / QUALITIES.len() as f64).ln();
-        let share = |log: f64| (log - most).exp() / total;
-        let mean: Phi = each.iter().map(|(l, _, m, _)| m * share(*l)).sum();
-        let scatter = each.iter().map(|(l, s, _, _)| s * share(*l)).sum();
+        let weight = |log: f64| (log - most).exp() / total;
+        let mean: Phi = each.iter().map(|(l, _, m, _)| m * weight(*l)).sum();
+        let scatter = each.iter().map(|(l, s, _, _)| s * weight(*l)).sum();
         let mut cov = SMatrix::<f64, PARAMETERS, PARAMETERS>::zeros();
         for (l, _, m, c) in &each {
-            cov += (c + (m - mean) * (m - mean).transpose()) * share(*l);
+            cov += (c + (m - mean) * (m - mean).transpose()) * weight(*l);
         }
         mean.iter().chain(cov.iter()).all(|v| v.is_finite()).then_some(Mixture { mean, cov, scatter, log_odds })
     }
@@ -105,7 +105,7 @@ impl<'a> Epipolar<'a> {
         let mut normal = SMatrix::<f64, PARAMETERS, PARAMETERS>::identity();
         let mut gradient = *phi;
         for ((r, j), m) in r.iter().zip(&j).zip(self.matches) {
-            let w = weight(*r, m.sigma.max(LEAST_SIGMA_PX));
+            let w = weight(*r, m.sigma.max(MIN_SIGMA_PX));
             if r.is_finite() && w > 0.0 {
                 normal += j * j.transpose() * w;
                 gradient += j * (r * w);
@@ -117,8 +117,7 @@ impl<'a> Epipolar<'a> {
     }
 }
 
-/// Mean and covariance of the error, the scatter of right matches, pixels, and the logarithm of the odds of no error
-/// at all.
+/// Mean and covariance of the error, the scatter of correct matches in pixels, and the log odds of no error at all.
 pub(super) struct Mixture {
     pub(super) mean: Phi,
     pub(super) cov: SMatrix<f64, PARAMETERS, PARAMETERS>,
@@ -126,33 +125,33 @@ pub(super) struct Mixture {
     pub(super) log_odds: f64,
 }
 
-/// A match in the linear model: distance from its line at zero error, the distance's slope, and what the match itself
-/// is off by.
+/// A match in the linear model: distance from its line at zero error, slope of the distance, and standard deviation of
+/// the match.
 struct Row {
     residual: f64,
     slope: Phi,
     sigma: f64,
 }
 
-/// Probability densities of a match that is right, and of one that is false, where it lies `t` standard deviations
-/// `s` from its line.
+/// Probability densities of a correct and of a false match at `t` standard deviations `s` from its line, each times
+/// its prior.
 fn densities(t: f64, s: f64) -> (f64, f64) {
     let root = (2.0 * std::f64::consts::PI).sqrt();
-    ((1.0 - FALSE) / (s * root) * (-0.5 * t * t).exp(), FALSE / SPREAD_PX)
+    ((1.0 - P_FALSE) / (s * root) * (-0.5 * t * t).exp(), P_FALSE / SPREAD_PX)
 }
 
 /// Log likelihood of the matches for an error.
-fn right_or_false(rows: &[Row], at: &Phi, scatter: f64) -> f64 {
+fn log_likelihood(rows: &[Row], at: &Phi, scatter: f64) -> f64 {
     let each = rows.iter().map(|row| {
         let s = scatter.hypot(row.sigma);
-        let (right, wrong) = densities((row.residual + row.slope.dot(at)) / s, s);
-        (right + wrong).ln()
+        let (correct, wrong) = densities((row.residual + row.slope.dot(at)) / s, s);
+        (correct + wrong).ln()
     });
     WEIGHT * each.sum::<f64>()
 }
 
-/// Maximum a posteriori for one scatter and one quality, with its log evidence: a match is right, and scatters so
-/// much, or it is false and lies anywhere within [`SPREAD_PX`].
+/// Maximum a posteriori for one scatter and one quality, with its log evidence. A match is correct with this scatter,
+/// or false and uniform within [`SPREAD_PX`].
 fn robust(rows: &[Row], start: &Phi, scatter: f64, q: f64) -> Option<(f64, Phi, SMatrix<f64, PARAMETERS, PARAMETERS>)> {
     let identity = SMatrix::<f64, PARAMETERS, PARAMETERS>::identity();
     let mut at = *start;
@@ -162,9 +161,9 @@ fn robust(rows: &[Row], start: &Phi, scatter: f64, q: f64) -> Option<(f64, Phi, 
         for Row { residual: r0, slope: j, sigma } in rows {
             let s = scatter.hypot(*sigma);
             let t = (r0 + j.dot(&at)) / s;
-            let (right, wrong) = densities(t, s);
-            log += WEIGHT * (right + wrong).ln();
-            let w = WEIGHT * right / (right + wrong) / (s * s);
+            let (correct, wrong) = densities(t, s);
+            log += WEIGHT * (correct + wrong).ln();
+            let w = WEIGHT * correct / (correct + wrong) / (s * s);
             if w > 1e-9 {
                 n += j * j.transpose() * w;
                 b -= j * (r0 * w);

@@ -1,4 +1,4 @@
-//! PRIOR
+//! Parameters and prior of the error of a rig file.
 
 use crate::offline::edges::lens::projection;
 use crate::offline::types::projection::Projection;
@@ -8,30 +8,31 @@ use nalgebra::{SVector, UnitQuaternion, Vector3};
 /// Number of parameters of a rig's error.
 pub const PARAMETERS: usize = 12;
 
-/// A rig's error in units of its prior's standard deviations: rotation (3), place of the right camera (3), focal
-/// length common and difference, principal point left (2) and right (2).
+/// Error of a rig in units of the prior's standard deviations: rotation (3) and position (3) of the right camera,
+/// common and differential focal length, principal point left (2) and right (2).
 pub type Phi = SVector<f64, PARAMETERS>;
 
-/// Standard deviations of what a rig file may have wrong: the rig's stated quality, or the default of
+/// Standard deviations of the error of a rig file: its stated quality, or the default of
 /// [`graspd_rt::geom::RigError`].
 ///
-/// The right camera may also stand elsewhere, along each axis by as large a part of the baseline as its rotation is
-/// off in radians: the baseline's direction is known no better than the cameras' own.
+/// The position of the right camera has the standard deviation of its rotation in radians times the baseline along
+/// every axis: the direction of the baseline is no better known than the orientation of the cameras.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RigPrior(pub graspd_rt::geom::RigError);
 
 impl RigPrior {
-    pub(super) fn none() -> Self {
+    /// A rig without error.
+    pub(super) fn exact() -> Self {
         Self(graspd_rt::geom::RigError::default().scaled(0.0))
     }
 
-    /// The rig with an error of so many standard deviations put right.
+    /// The rig corrected by an error in standard deviations.
     pub(super) fn corrected(&self, rig: &Rig, phi: &Phi) -> Rig {
         let mut out = *rig;
         let turn = Vector3::new(phi[0], phi[1], phi[2]) * self.0.rotation_rad;
         out.right_from_left.rotation = UnitQuaternion::from_scaled_axis(turn) * rig.right_from_left.rotation;
         let baseline = rig.right_from_left.translation.vector.norm();
-        // Turned about the right camera's own centre, which then moves.
+        // The rotation is about the right camera's own centre, which is displaced afterwards.
         let centre = rig.centre(View::Right) + Vector3::new(phi[3], phi[4], phi[5]) * (self.0.rotation_rad * baseline);
         out.right_from_left.translation.vector = -(out.right_from_left.rotation * centre);
         let (common, half) = (self.0.focal * phi[6], self.0.focal_difference * phi[7]);
@@ -45,7 +46,7 @@ impl RigPrior {
     }
 }
 
-/// Derivatives of both projection matrices by the error's parameters, in units of the prior.
+/// Derivatives of both projection matrices by the parameters of the error, in units of the prior.
 pub(super) fn derivatives(rig: &Rig, prior: &RigPrior) -> [[Projection; 2]; PARAMETERS] {
     const STEP: f64 = 0.05;
     std::array::from_fn(|i| {

@@ -71,7 +71,7 @@ mod tests {
             rim_points(&p[v], &truth, 200).into_iter().map(|uv| one(uv, &mut random)).collect::<Vec<_>>()
         });
         let fit = |rim| {
-            let o = Options { rim, ..Options::default() }.tolerating_anything();
+            let o = Options { rim, ..Options::default() }.without_tolerance();
             reconstruct(&points[0], &p[0], &points[1], &p[1], &o).unwrap()
         };
         let (circle, ellipse) = (fit(RimChoice::Circle), fit(RimChoice::Ellipse));

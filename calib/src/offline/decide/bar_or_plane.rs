@@ -141,7 +141,7 @@ fn look_for_bars(
     let clean =
         best.is_some_and(|j| j.best().is_some_and(|b| b.model == Model::Circle && b.fitted.wave_px <= CLEAN_PX));
     let plane = (start.centre, start.normal, (start.a * start.b).sqrt());
-    let search = search::find(views, clicked, plane, p, &options.tolerating_anything(), clean);
+    let search = search::find(views, clicked, plane, p, &options.without_tolerance(), clean);
     let (seen, usual) = (search.seen.clamp(0.02, 0.98), search.usual.clamp(0.02, OTHER_OUTLINE_SEEN - 0.05));
     let as_bar = seen * (OTHER_OUTLINE_SEEN / usual).ln();
     let as_none = (1.0 - seen) * ((1.0 - OTHER_OUTLINE_SEEN) / (1.0 - usual)).ln();

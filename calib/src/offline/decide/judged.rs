@@ -1,6 +1,6 @@
 //! JUDGED
 
-use crate::offline::contour::{Contour, ViewEdges, told_apart};
+use crate::offline::contour::{Contour, ViewEdges, separate_pair};
 use crate::offline::correspondence::rig_error::RigError;
 use crate::offline::decide::models::{Model, Weighed, plane_models, probabilities};
 use crate::offline::rim::model::{Options, RimModel, Score};
@@ -77,7 +77,7 @@ pub(super) fn judge(
     rig: &RigError,
     options: &Options,
 ) -> Result<Judged, Refusal> {
-    let contours = told_apart(views, clicked);
+    let contours = separate_pair(views, clicked);
     let points = [0, 1].map(|k| contours[k].edge_points(Outline::Outer));
     let analysis = analyse([&points[0], &points[1]], [&rig.p[0], &rig.p[1]], options)?;
     let models = plane_models([&contours[0], &contours[1]], &analysis, options.rim, rig);

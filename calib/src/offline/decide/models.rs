@@ -224,7 +224,7 @@ mod tests {
         };
         let mut right_from_left = graspd_rt::geom::Pose::identity();
         right_from_left.translation.vector.x = -0.3;
-        let rig = RigError::none(&Rig { left: camera, right: camera, right_from_left });
+        let rig = RigError::exact(&Rig { left: camera, right: camera, right_from_left });
         let rim = rim_tilted(Vector3::new(0.1, 0.02, 1.2), 0.5, 1.0, 0.08, 0.08);
         let views = [0, 1].map(|k| {
             let middle = project(&rig.p[k], &rim.centre);

@@ -1,4 +1,4 @@
-//! MAP
+//! Edge detection over a whole image, and the index of its edge points by pixel.
 
 use crate::offline::edges::gradient::{GradientRow, GradientRows, RADIUS, SCALE};
 use crate::offline::edges::grey_image::GreyImage;
@@ -7,7 +7,7 @@ use graspd_rt::geom::Pixel;
 /// A detected edge point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Edge {
-    /// Sub-pixel place.
+    /// Sub-pixel position.
     pub at: Pixel,
     /// Unit gradient, towards the brighter side.
     pub towards_bright: Pixel,
@@ -15,19 +15,20 @@ pub struct Edge {
     pub strength: f64,
 }
 
-/// Pixels of a row that share an entry of the index.
+/// Pixels of a row that share one entry of the index.
 const BLOCK: usize = 16;
 
-/// Every edge point of an image, and which ones lie near a place.
+/// All edge points of an image, with an index for the points near a pixel.
 #[derive(Clone, Debug)]
 pub struct EdgeMap {
     width: usize,
     height: usize,
     edges: Vec<Edge>,
-    /// Column of the pixel that each edge point was found in.
+    /// Column of the pixel in which each edge point was found.
     columns: Vec<u32>,
-    /// Index of the first edge point in or after each block, block by block in raster order, and the number of points at the end.
-    /// An image has few edge points: a word for each pixel would be as large as all the rest, and cost its page faults.
+    /// Index of the first edge point in or after each block, in raster order, and the number of points at the end.
+    /// Edge points are sparse: an entry for every pixel would be as large as the rest of the map, and would cost its
+    /// page faults.
     starts: Vec<u32>,
     noise: f64,
 }
@@ -36,7 +37,8 @@ impl EdgeMap {
     /// Detects the edges of a whole image.
     pub fn detect(image: &GreyImage) -> Self {
         let noise = image.noise();
-        // The gradient's own noise is noise / (sqrt(8 pi) SCALE^2); five times that is left to chance once in a million pixels.
+        // The standard deviation of the gradient's noise is noise / (sqrt(8 pi) SCALE^2). Noise alone exceeds five
+        // times that about once in a million pixels.
         let threshold = (5.0 * noise / (8.0 * std::f64::consts::PI).sqrt() / (SCALE * SCALE)).max(1.2) as f32;
         let (w, h) = (image.width(), image.height());
         let mut map = Self { width: w, height: h, edges: Vec::new(), columns: Vec::new(), starts: Vec::new(), noise };
@@ -49,9 +51,9 @@ impl EdgeMap {
         map
     }
 
-    /// Takes the edge points of a row from its gradient and its neighbours'.
+    /// Adds the edge points of one row, from its gradient and that of its neighbours.
     fn scan(&mut self, y: usize, [above, row, below]: [&GradientRow; 3], threshold: f32) {
-        // A little lower than the threshold, so that only candidates need their root.
+        // Slightly below the threshold, so that the square root is taken of candidates only.
         let candidate = threshold * threshold * 0.999;
         for (i, square) in row.square.iter().enumerate() {
             if *square < candidate {
@@ -84,7 +86,7 @@ impl EdgeMap {
         }
     }
 
-    /// Ends every block up to and with the one before this, so that the next edge point lies in it.
+    /// Ends all blocks before this one, so that the next edge point belongs to it.
     fn index_to(&mut self, block: usize) {
         let n = self.edges.len() as u32;
         self.starts.resize(self.starts.len().max(block + 1), n);
@@ -110,7 +112,7 @@ impl EdgeMap {
         self.noise
     }
 
-    /// Edge points found in the pixels at most `radius` away, with their index, in raster order.
+    /// Edge points of the pixels at most `radius` away, with their index, in raster order.
     pub fn near(&self, p: Pixel, radius: i32) -> impl Iterator<Item = (usize, &Edge)> {
         let ((x0, x1), ys) = self.rows_within(p, p, radius);
         ys.flat_map(move |y| {
@@ -120,7 +122,8 @@ impl EdgeMap {
         })
     }
 
-    /// The same for all pixels from one corner of a rectangle to the other, given to a function by index, column and row: for where most time is spent.
+    /// Calls `take` with index, column and row of every edge point within `radius` of a rectangle. The fast path of
+    /// [`Self::near`].
     pub(in crate::offline) fn within(
         &self,
         first: Pixel,
@@ -139,7 +142,7 @@ impl EdgeMap {
         }
     }
 
-    /// Columns from and to, and rows, of the pixels at most `radius` from a rectangle; no rows where the image does not reach.
+    /// Range of columns and rows within `radius` pixels of a rectangle; no rows where it lies outside the image.
     fn rows_within(&self, first: Pixel, last: Pixel, radius: i32) -> ((u32, u32), std::ops::Range<usize>) {
         let span = |first: f64, last: f64, size: usize| {
             let end = i32::try_from(size).unwrap_or(i32::MAX) - 1;
@@ -153,7 +156,7 @@ impl EdgeMap {
         ((x0 as u32, x1 as u32), y0 as usize..y1 as usize + 1)
     }
 
-    /// The edge points of a row's blocks from one column to another: the first's index, their columns, and they.
+    /// Edge points of the blocks of a row between two columns: index of the first, their columns, and the points.
     fn blocks(&self, y: usize, x0: u32, x1: u32) -> (usize, &[u32], &[Edge]) {
         let row = y * self.width.div_ceil(BLOCK);
         let (from, to) =

@@ -1,10 +1,13 @@
-//! Sub-pixel edge points: Gaussian gradient, non-maximum suppression, and an exact step to the edge for the points that are kept.
+//! Sub-pixel edge points: Gaussian gradient, non-maximum suppression, and an exact step to the edge for the points
+//! that are kept.
 //!
-//! Detection is Canny's with Devernay's parabola (INRIA RR-2724), good to about 0.1 px and used only to find contours. What goes
-//! into the geometry is [`refine`]: the zero of the second derivative along the edge's normal, with the Gaussian derivatives evaluated *at* the
-//! sub-pixel place instead of interpolated between pixels, so that no pattern of the pixel grid is left in it (below 0.01 px, tested). Its standard
-//! deviation follows from the pixel noise and the third derivative; its bias on a curved edge, `w^2 / (2 R)` towards the inside for an
-//! edge of width `w` (Mendonca), is removed by [`Refined::straightened`] once the curvature is known.
+//! Detection ([`EdgeMap`]) is Canny's with Devernay's parabola (INRIA RR-2724). It is accurate to about 0.1 px and
+//! only finds contours. The geometry uses [`refine()`]: the zero of the second derivative along the edge's normal,
+//! with the Gaussian derivatives evaluated at the sub-pixel position instead of interpolated between pixels. This
+//! leaves no pattern of the pixel grid (below 0.01 px, tested). The standard deviation follows from the pixel noise
+//! and the third derivative. The bias on a curved edge, `w^2 / (2 R)` towards the inside for an edge of width `w`
+//! (Mendonca), is removed by [`Refined::straightened`] once the curvature is known. Edges that overlap their
+//! neighbours are located by `separate`.
 
 pub mod arcs;
 mod gradient;

@@ -1,26 +1,26 @@
-//! REFINE
+//! Refinement of an edge point to the zero of the second derivative along its gradient.
 
 use crate::offline::edges::gradient::{RADIUS, SCALE};
 use crate::offline::edges::grey_image::GreyImage;
 use crate::offline::edges::map::Edge;
 use graspd_rt::geom::Pixel;
 
-/// An edge point brought to the zero of the second derivative.
+/// An edge point refined to the zero of the second derivative.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Refined {
-    /// Sub-pixel place.
+    /// Sub-pixel position.
     pub at: Pixel,
     /// Unit gradient, towards the brighter side.
     pub towards_bright: Pixel,
-    /// Standard deviation across the edge from the pixel noise, pixels.
+    /// Standard deviation across the edge due to the pixel noise, pixels.
     pub sigma: f64,
     /// Standard deviation of the edge's profile (lens, pixel and detector together), pixels.
     pub width: f64,
 }
 
 impl Refined {
-    /// The same point with the smoothing's pull towards the inside of a curve of radius `radius` (pixels) removed;
-    /// `outward` is the unit normal away from the centre of curvature.
+    /// The point with the bias of the smoothing towards the inside of a curve removed. `radius` is the radius of
+    /// curvature in pixels, `outward` the unit normal away from the centre of curvature.
     pub fn straightened(mut self, outward: Pixel, radius: f64) -> Self {
         if radius > 2.0 {
             self.at += outward * (0.5 * self.width * self.width / radius).min(0.3);
@@ -29,16 +29,17 @@ impl Refined {
     }
 }
 
-/// Steps from an edge point to the place where the second derivative along its gradient vanishes.
+/// Moves an edge point to the zero of the second derivative along its gradient (Newton's method). `noise` is in grey
+/// levels.
 ///
-/// `None` when there is no edge within a pixel and a half, or the image ends. `noise` is in grey levels.
+/// `None` when there is no edge within 1.5 px or the image ends.
 pub fn refine(image: &GreyImage, start: &Edge, noise: f64) -> Option<Refined> {
     let mut p = start.at;
     for _ in 0..8 {
         let d = Derivatives::at(image, p)?;
         let g = Pixel::new(d.x, d.y);
         let m = g.norm();
-        // The direction may turn with the better place, not swing to another edge.
+        // The direction may turn as the position improves, but not change to another edge.
         if !(m > 1e-3) || g.dot(&start.towards_bright) < 0.8 * m {
             return None;
         }
@@ -69,7 +70,7 @@ pub fn refine(image: &GreyImage, start: &Edge, noise: f64) -> Option<Refined> {
     None
 }
 
-/// Derivatives of the smoothed image at a sub-pixel place.
+/// Derivatives of the smoothed image at a sub-pixel position.
 struct Derivatives {
     x: f64,
     y: f64,
@@ -91,7 +92,7 @@ impl Derivatives {
         }
         let (x0, y0) = ((p.x.round() - r) as usize, (p.y.round() - r) as usize);
         let (ku, kv) = (kernels(x0 as f64 - p.x), kernels(y0 as f64 - p.y));
-        // Rows first: the four derivatives along x of every row, then along y.
+        // Rows first: the four derivatives along x of every row, then those along y.
         let mut d = [[0.0f64; 4]; 4];
         for (j, wv) in kv.iter().enumerate() {
             let row = image.row(y0 + j).get(x0..x0 + N)?;
@@ -109,7 +110,8 @@ impl Derivatives {
     }
 }
 
-/// Gaussian and its first three derivatives (as correlation weights) at `first, first + 1, ...` from the sub-pixel place.
+/// Gaussian and its first three derivatives, as correlation weights at `first, first + 1, ...` from the sub-pixel
+/// position.
 fn kernels(first: f64) -> [[f64; 4]; 2 * RADIUS + 3] {
     let s2 = SCALE * SCALE;
     let norm = 1.0 / (2.0 * std::f64::consts::PI * s2).sqrt();
@@ -128,7 +130,7 @@ mod tests {
     use rand::SeedableRng;
     use rand_distr::{Distribution, Normal};
 
-    /// A sharp disc, blurred in the plane by a Gaussian lens of 0.6 px and integrated over pixels, by dense sampling.
+    /// A sharp disc, blurred by a Gaussian lens of 0.6 px and integrated over pixels, by dense sampling.
     fn disc(side: usize, c: Pixel, radius: f64, noise: f64, seed: u64) -> GreyImage {
         const SUB: usize = 6;
         let n = side * SUB;

@@ -143,11 +143,11 @@ mod tests {
     use rand::SeedableRng;
     use rand_distr::{Distribution, Normal};
 
-    /// Straight stripes `(from, to, grey)` across a direction, blurred by a Gaussian lens and integrated over pixels.
+    /// Straight edges `(position, rise)` across a direction, blurred by a Gaussian lens and integrated over pixels.
     fn stripes(n: Pixel, edges: &[(f64, f64)], blur: f64, noise: f64, seed: u64) -> GreyImage {
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
         let normal = Normal::new(0.0, noise.max(1e-9)).unwrap();
-        // The Gaussian step as a table of its running sum.
+        // The normal distribution function as a table.
         let mut table = vec![0.0f64; 2401];
         for k in 1..table.len() {
             let t = -6.0 + (k as f64 - 0.5) * 0.005;
@@ -162,11 +162,11 @@ mod tests {
             .map(|i| {
                 let (x, y) = (f64::from(i % 48) - 24.0, f64::from(i / 48) - 24.0);
                 let mut v = 60.0;
-                for (place, rise) in edges {
+                for (position, rise) in edges {
                     for b in 0..3 {
                         for a in 0..3 {
                             let (u, w) = (x + (f64::from(a) - 1.0) / 3.0, y + (f64::from(b) - 1.0) / 3.0);
-                            v += rise / 9.0 * step(((u * n.x + w * n.y - place) / blur).clamp(-6.0, 6.0));
+                            v += rise / 9.0 * step(((u * n.x + w * n.y - position) / blur).clamp(-6.0, 6.0));
                         }
                     }
                 }
@@ -176,21 +176,21 @@ mod tests {
         GreyImage::new(48, 48, data).unwrap()
     }
 
-    fn place(p: &GreyImage, n: Pixel, noise: f64, blur: f64) -> Option<(f64, f64)> {
+    fn position(p: &GreyImage, n: Pixel, noise: f64, blur: f64) -> Option<(f64, f64)> {
         let start = Refined { at: Pixel::new(24.0, 24.0), towards_bright: n, sigma: 0.1, width: 1.2 };
         let r = separate(p, &start, noise, blur)?;
         Some(((r.at - Pixel::new(24.0, 24.0)).dot(&n), r.sigma))
     }
 
     #[test]
-    fn a_line_three_pixels_wide_does_not_pull_its_edges() {
+    fn the_edges_of_a_line_three_pixels_wide_are_unbiased() {
         let blur = 0.75f64.hypot((1.0f64 / 12.0).sqrt());
         for k in 0..12 {
             let a = 0.27 * f64::from(k);
             let n = Pixel::new(a.cos(), a.sin());
             for width in [2.8, 3.3, 5.0] {
                 let p = stripes(n, &[(0.2, 110.0), (0.2 + width, -90.0)], 0.75, 0.0, 0);
-                let (at, _) = place(&p, n, 0.3, blur).unwrap();
+                let (at, _) = position(&p, n, 0.3, blur).unwrap();
                 assert!((at - 0.2).abs() < 0.03, "direction {a:.2} width {width}: {at}");
             }
         }
@@ -205,7 +205,7 @@ mod tests {
                 let a = 0.042 * seed as f64;
                 let n = Pixel::new(a.cos(), a.sin());
                 let p = stripes(n, &edges, 0.75, 3.0, seed);
-                if let Some((at, s)) = place(&p, n, 3.0, blur) {
+                if let Some((at, s)) = position(&p, n, 3.0, blur) {
                     sum += (at - 0.2f64).powi(2);
                     stated += s * s;
                     count += 1.0;

@@ -183,7 +183,7 @@ fn from_candidates(
             }
         })?;
     let Pair { contours, inner, reconstruction, rig: seen, .. } = found;
-    let matches = views.seen.seen;
+    let matches = views.seen.agreement;
     let grasp = grasp::choose(&seen, gripper, &reconstruction, &options.approach)?;
     let mut plan = assemble((contours, inner), reconstruction, grasp, (rig, &seen), gripper, options);
     plan.file.images = Some(pair_of(images.map(|p| ImageRecord {

@@ -1,4 +1,4 @@
-//! CHOICE
+//! The choice between circle and ellipse, the task's tolerance, and the report of a plane rim.
 
 use crate::offline::conic::sampson::distance;
 use crate::offline::rim::circle::vergence;
@@ -9,12 +9,13 @@ use crate::offline::rim::refusal::Refusal;
 use crate::offline::types::projection::Projection;
 use crate::offline::types::{EdgePoint, Outline};
 
-/// Limit of the centre's standard deviation as a fraction of the radius when the task states none.
-const CENTRE_FRACTION: f64 = 0.1;
-/// Chi-squared by which a circle may fit worse than an ellipse with its two more parameters (four standard deviations for two degrees of freedom).
-const BETWEEN: f64 = 19.4;
+/// Default limit of the centre's standard deviation, as a fraction of the radius.
+const MAX_SIGMA_CENTRE_FRACTION: f64 = 0.1;
+/// Chi-squared by which a circle may fit worse than an ellipse, which has two more parameters: four standard
+/// deviations at two degrees of freedom.
+const MAX_CIRCLE_EXCESS: f64 = 19.4;
 
-/// The plane models alone.
+/// The better of the plane models.
 pub(crate) fn plane(
     a: &Analysis,
     points: [&[EdgePoint]; 2],
@@ -26,11 +27,16 @@ pub(crate) fn plane(
     Ok(plane_result(a, &fit, scores, points, p, options))
 }
 
-/// Chooses between circle and ellipse by the information criterion (or as told), and holds the winner against the task's tolerance.
+/// Chooses between circle and ellipse by the information criterion (or as requested), and checks the result against
+/// the task's tolerance.
+///
+/// # Errors
+/// A [`Refusal`] when the requested model does not fit, the cameras look at opposite faces, or the result is too
+/// uncertain.
 pub fn choose_plane_model(a: &Analysis, rim: RimChoice, options: &Options) -> Result<(MlFit, Vec<Score>), Refusal> {
     let ellipse = a.ellipse.as_ref();
     let circle = a.circle.as_ref();
-    // The noise that the richer model leaves is the yardstick for both.
+    // The noise of the model with more parameters is the scale for both.
     let noise = ellipse.or(circle).map_or(1.0, |f| noise_of(f, a, options));
     let mut scores: Vec<Score> =
         [circle, ellipse].into_iter().flatten().map(|f| score(f.model, f.chi2, f.parameters, f.count, noise)).collect();
@@ -43,7 +49,7 @@ pub fn choose_plane_model(a: &Analysis, rim: RimChoice, options: &Options) -> Re
                 c
             } else if round_within_bias(e, a, options) {
                 for s in scores.iter_mut().filter(|s| s.model == RimModel::Ellipse) {
-                    s.excluded = Some("a circle within the edges' systematic error");
+                    s.excluded = Some("a circle, within the systematic error of the edges");
                 }
                 c
             } else {
@@ -54,12 +60,13 @@ pub fn choose_plane_model(a: &Analysis, rim: RimChoice, options: &Options) -> Re
         (_, Err(_), e) => e.map_err(Clone::clone)?,
     };
     let noise = noise_of(fit, a, options);
-    // As good a circle between the cameras with two parameters less, or a better one than the circle before them.
-    let margin = if fit.model == RimModel::Ellipse { BETWEEN } else { -BETWEEN };
-    let yardstick = noise_of(a.ellipse.as_ref().unwrap_or(fit), a, options);
-    if a.between.is_some_and(|(_, chi2)| chi2 < fit.chi2 + margin * yardstick * yardstick) {
+    // Refuse when the plane between the cameras carries a circle that fits as well with two parameters fewer, or a
+    // better one than the circle in front of them.
+    let margin = if fit.model == RimModel::Ellipse { MAX_CIRCLE_EXCESS } else { -MAX_CIRCLE_EXCESS };
+    let scale = noise_of(a.ellipse.as_ref().unwrap_or(fit), a, options);
+    if a.between.is_some_and(|(_, chi2)| chi2 < fit.chi2 + margin * scale * scale) {
         return Err(Refusal::OppositeSides {
-            why: "the plane between the cameras carries a circle there, the one before them none",
+            why: "the plane between the cameras carries a circle, the plane in front of them does not",
         });
     }
     tolerable(
@@ -73,8 +80,8 @@ pub fn choose_plane_model(a: &Analysis, rim: RimChoice, options: &Options) -> Re
     Ok((fit.clone(), scores))
 }
 
-/// Whether an ellipse is so nearly round that the edges' systematic error alone could have made it (errata D: a circle when `1 - b/a`
-/// is within three standard deviations of zero; detected edges carry an error that does not average out over their number).
+/// Whether an ellipse is so nearly round that the systematic error of the edges could have caused the difference: `1 -
+/// b/a` within three standard deviations of zero. This error of detected edges does not average out over their number.
 fn round_within_bias(e: &MlFit, a: &Analysis, options: &Options) -> bool {
     let radius = a.fits.iter().map(|f| f.fit.ellipse.a).fold(f64::INFINITY, f64::min);
     1.0 - e.rim.b / e.rim.a <= 3.0 * options.edge_bias_px / radius
@@ -86,7 +93,7 @@ pub(crate) fn score(model: RimModel, chi2: f64, parameters: usize, count: usize,
     Score { model, chi2, parameters, bic, excluded: None }
 }
 
-/// Noise of a fit: its residuals', but never below the given sigmas if so asked, nor below rounding.
+/// Noise of a fit, from its residuals; not below the given sigmas if so requested, nor below rounding.
 fn noise_of(fit: &MlFit, a: &Analysis, options: &Options) -> f64 {
     match options.noise {
         Noise::AtLeastGiven => fit.noise().max(1.0),
@@ -94,14 +101,14 @@ fn noise_of(fit: &MlFit, a: &Analysis, options: &Options) -> f64 {
     }
 }
 
-/// Holds a decided reconstruction against the task's tolerance *in the images*: the loop closes in both, so that the absolute error that a
-/// rig moves rim and marks by together does not reach the grasp.
+/// Checks a reconstruction against the task's tolerance *in the images*. The loop closes in both images, so that an
+/// absolute error by which the rig displaces rim and marks together does not reach the grasp.
 pub(crate) fn tolerable_in_images(r: &Reconstruction, options: &Options) -> Result<(), Refusal> {
     let (centre, normal) = (r.report.sigma_centre_in_images, r.report.sigma_normal_in_images);
     tolerable(centre, normal, r.rim.a, r.report.vergence, r.model, options)
 }
 
-/// Refuses a result that is less certain than the task allows, with the advice that fits the cause.
+/// Refuses a result that is less certain than the task allows, with advice that fits the cause.
 pub(crate) fn tolerable(
     sigma_centre: f64,
     sigma_normal: f64,
@@ -110,16 +117,16 @@ pub(crate) fn tolerable(
     model: RimModel,
     options: &Options,
 ) -> Result<(), Refusal> {
-    let limit_centre = options.max_sigma_centre.unwrap_or(CENTRE_FRACTION * radius);
+    let limit_centre = options.max_sigma_centre.unwrap_or(MAX_SIGMA_CENTRE_FRACTION * radius);
     if sigma_centre <= limit_centre && sigma_normal <= options.max_sigma_normal {
         return Ok(());
     }
     let advice = if vergence < 5.0_f64.to_radians() {
         "the cameras see the rim from nearly the same direction: widen the baseline or move the rig closer"
     } else if model == RimModel::Ellipse {
-        "click more of the rim, or say that it is a circle if it is one"
+        "click more of the rim, or specify a circle (--rim circle) if it is one"
     } else {
-        "click more of the rim, move the rig closer, or see it more from its face"
+        "click more of the rim, move the rig closer, or view its face less obliquely"
     };
     Err(Refusal::TooUncertain {
         sigma_centre,
@@ -131,7 +138,7 @@ pub(crate) fn tolerable(
     })
 }
 
-/// The report's part that does not depend on the model.
+/// The fields of the report that do not depend on the model.
 pub(crate) fn base_report(a: &Analysis, points: [&[EdgePoint]; 2]) -> Report {
     let routes_differ = match (&a.paper, &a.polar) {
         (Ok(x), Ok(y)) => x.rim.normal.cross(&y.rim.normal).norm().atan2(x.rim.normal.dot(&y.rim.normal)),

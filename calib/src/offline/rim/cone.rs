@@ -1,7 +1,7 @@
-//! The projective cone of an image's conic, `Q = P^T C P` (section 4.1), in a frame in which its numbers mean something.
+//! The projective cone of an image's conic, `Q = P^T C P` (section 4.1), in a normalised frame.
 //!
-//! Errata B8: with the image centred on the ellipse and the world centred on the rim with the rim's size as unit, both cones are about
-//! `x^2 + y^2 - 1` and the residues of the pencil are comparable between scenes.
+//! The image is centred on the ellipse, and the world on the rim with the rim's size as unit. Both cones are then
+//! close to `x^2 + y^2 - 1`, and the residues of the pencil are comparable between scenes.
 
 use crate::offline::conic::{ellipse_of, orient};
 use crate::offline::rim::refusal::Refusal;
@@ -10,7 +10,10 @@ use crate::offline::types::projection::{Projection, camera_centre, depth, focal_
 use graspd_rt::geom::View;
 use nalgebra::{Matrix3, Matrix4, SMatrix, Vector3, Vector4};
 
-/// Checks a pair of cameras: finite entries, finite centres, a baseline.
+/// Checks a pair of cameras: finite entries, finite centres, a baseline. Returns both centres.
+///
+/// # Errors
+/// [`Refusal::BadInput`], [`Refusal::Camera`] or [`Refusal::NoBaseline`].
 pub fn check_cameras(left: &Projection, right: &Projection) -> Result<[Vector3<f64>; 2], Refusal> {
     for (view, p) in [(View::Left, left), (View::Right, right)] {
         if p.iter().any(|v| !v.is_finite()) {
@@ -23,7 +26,7 @@ pub fn check_cameras(left: &Projection, right: &Projection) -> Result<[Vector3<f
     let (Some(o), Some(q)) = (camera_centre(left), camera_centre(right)) else {
         return Err(Refusal::Camera { view: View::Left });
     };
-    // Far from the origin the centres themselves carry rounding, hence the relative term.
+    // Far from the origin the centres themselves are rounded, hence the relative term.
     if !((o - q).norm() > 1e-9 * (o.norm() + q.norm()) + f64::MIN_POSITIVE) {
         return Err(Refusal::NoBaseline);
     }
@@ -47,6 +50,9 @@ pub struct ConePair {
 
 impl ConePair {
     /// Builds both cones from the images' conics.
+    ///
+    /// # Errors
+    /// A [`Refusal`] when the cameras or conics are degenerate, or the rays of the ellipses' centres are parallel.
     pub fn new(c: [&Matrix3<f64>; 2], p: [&Projection; 2]) -> Result<Self, Refusal> {
         let o = check_cameras(p[0], p[1])?;
         let e = ellipses(c)?;
@@ -125,7 +131,7 @@ pub(crate) fn complement(a: &Vector4<f64>, b: &Vector4<f64>) -> Option<SMatrix<f
     let v = (b - u * u.dot(b)).normalize();
     let mut basis = [u, v, Vector4::zeros(), Vector4::zeros()];
     for k in 2..4 {
-        // The unit vector that the basis explains least is the safest to orthogonalise.
+        // The unit vector with the largest component outside the basis is the safest to orthogonalise.
         let best = (0..4)
             .map(|i| Vector4::ith(i, 1.0))
             .map(|e| basis[..k].iter().fold(e, |r, q| r - q * q.dot(&e)))
