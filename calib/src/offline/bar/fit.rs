@@ -1,4 +1,4 @@
-//! BARFIT
+//! The robust fit of a torus to the outlines of both views.
 
 use crate::offline::bar::torus::{Free, Ray, Torus, TorusFit, fit, rays};
 use crate::offline::conic::robust::GATE;
@@ -12,23 +12,30 @@ use crate::offline::types::projection::Projection;
 use crate::offline::types::{EdgePoint, Outline};
 use nalgebra::Matrix2;
 
-/// The limits of the excess with 5 and 6 degrees of freedom over that with 2, at 4 sigma.
-const MORE_FREEDOM: f64 = 1.5;
+/// Ratio of the excess limit with 5 or 6 degrees of freedom to that with 2, at 4 sigma.
+const EXCESS_LIMIT_RATIO: f64 = 1.5;
 
-/// A torus fitted to both views, with what is needed to compare and to report it.
+/// A torus fitted to both views, with the data for comparing and reporting it.
 pub(crate) struct BarFit {
     pub(crate) fit: TorusFit,
     /// Residuals of all points in pixels, left then right, in the order given.
     pub(crate) residuals: [Vec<f64>; 2],
+    /// Whether each point is an inlier.
     pub(crate) keep: [Vec<bool>; 2],
     pub(crate) noise: f64,
     pub(crate) count: usize,
+    /// Two-view excess in units of the noise variance, and its limit.
     pub(crate) excess: f64,
     pub(crate) limit: f64,
+    /// Whether both views have an inner outline.
     pub(crate) inner: bool,
 }
 
-/// Fits the round bar. `outer` is the analysis of the outer outlines as if they were plane.
+/// Fits the round bar. `outer` is the plane analysis of the outer outlines.
+///
+/// # Errors
+/// [`Refusal::NoFit`] when the fit diverges or most points are off the outlines; [`Refusal::BadInput`] for an
+/// impossible diameter.
 pub(crate) fn fit_bar(
     points: [&[EdgePoint]; 2],
     p: [&Projection; 2],
@@ -48,12 +55,12 @@ pub(crate) fn fit_bar(
     let mut fitted = None;
     for round in 0..12 {
         let r = scaled(&torus);
-        // The start is wrong by several pixels: let everything within reach of it in first.
+        // The start is off by several pixels: the first gate is wider.
         let gate = (if round == 0 && options.robust { 4.0 } else { GATE }) * (MAD * median(r.clone())).max(1e-9);
         let next: Vec<bool> = r.iter().map(|x| !options.robust || *x <= gate).collect();
-        let settled = round > 1 && next == keep;
+        let unchanged = round > 1 && next == keep;
         keep = next;
-        if settled {
+        if unchanged {
             break;
         }
         let found = fit(&all, &keep, &torus, free).ok_or(Refusal::NoFit { why: "the torus fit diverged" })?;
@@ -64,7 +71,7 @@ pub(crate) fn fit_bar(
         }
     }
     let mut fitted = fitted.ok_or(Refusal::NoFit { why: "the torus fit diverged" })?;
-    // The normal is that of the face which the cameras see.
+    // The normal points out of the face that the cameras see.
     if (outer.centres[0] - torus.centre).dot(&torus.normal) < 0.0 {
         flip(&mut fitted);
     }
@@ -78,13 +85,13 @@ pub(crate) fn fit_bar(
         one_view_chi2(&all, &keep, split, &fitted.torus, if inner { Free::OneView } else { Free::Pose });
     let single_noise = (excess_and_dof.0 / excess_and_dof.1.max(1) as f64).sqrt().max(1e-6);
     let known = options.noise == Noise::AtLeastGiven && single_noise <= 1.0;
-    let yardstick = if known { 1.0 } else { single_noise.max(1e-4 / typical_sigma(points[0])) };
+    let scale = if known { 1.0 } else { single_noise.max(1e-4 / typical_sigma(points[0])) };
     if options.noise == Noise::AtLeastGiven {
         noise = noise.max(1.0);
     }
-    let excess = ((fitted.chi2 - excess_and_dof.0) / (yardstick * yardstick)).max(0.0);
-    let slack = options.calibration_px / typical_sigma(points[0]) / yardstick;
-    let limit = MORE_FREEDOM * excess_limit(options.gate_sigmas, if known { None } else { Some(dof) })
+    let excess = ((fitted.chi2 - excess_and_dof.0) / (scale * scale)).max(0.0);
+    let slack = options.calibration_px / typical_sigma(points[0]) / scale;
+    let limit = EXCESS_LIMIT_RATIO * excess_limit(options.gate_sigmas, if known { None } else { Some(dof) })
         + slack * slack * count as f64;
     let torus = fitted.torus;
     let residuals = [0, 1].map(|k| per_view[k].iter().map(|r| torus.residual(r)).collect());
@@ -92,13 +99,13 @@ pub(crate) fn fit_bar(
     Ok(BarFit { fit: fitted, residuals, keep, noise, count, excess, limit, inner })
 }
 
-/// Turns the normal round; its chart's axes change with it.
+/// Reverses the normal and transforms the covariance to the new chart.
 fn flip(fit: &mut TorusFit) {
     let before = frame_of(&fit.torus.normal);
     fit.torus.normal = -fit.torus.normal;
     let after = frame_of(&fit.torus.normal);
     if let Some(c) = &mut fit.cofactor {
-        // A change dn of the old normal is -dn of the new one.
+        // A change dn of the old normal is a change -dn of the new one.
         let r = Matrix2::from_fn(|i, j| -after.column(i).dot(&before.column(j)));
         let mut t = nalgebra::SMatrix::<f64, 7, 7>::identity();
         t.fixed_view_mut::<2, 2>(3, 3).copy_from(&r);
@@ -106,7 +113,7 @@ fn flip(fit: &mut TorusFit) {
     }
 }
 
-/// Sum of the chi-squared of the best torus of each view alone, and its degrees of freedom.
+/// Summed chi-squared of the best torus of each view alone, and its degrees of freedom.
 fn one_view_chi2(all: &[Ray], keep: &[bool], split: usize, torus: &Torus, free: Free) -> (f64, usize) {
     let mut chi2 = 0.0;
     for (rays, keep) in [(&all[..split], &keep[..split]), (&all[split..], &keep[split..])] {
@@ -116,7 +123,8 @@ fn one_view_chi2(all: &[Ray], keep: &[bool], split: usize, torus: &Torus, free: 
     (if chi2.is_finite() { chi2 } else { 0.0 }, count.saturating_sub(12))
 }
 
-/// Start from the closed forms of the outlines: centre and normal of the outer (and inner) plane fits, radii by half sum and difference.
+/// Start from the closed forms of the outlines: centre and normal of the outer (and inner) plane fits, radii from half
+/// the sum and half the difference. Also returns whether both views have an inner outline.
 fn start(
     points: [&[EdgePoint]; 2],
     p: [&Projection; 2],
@@ -158,7 +166,7 @@ fn start(
     Ok((Torus { centre: rim.centre, normal: rim.normal, core: radius - r, bar: r }, has_inner))
 }
 
-/// The bar that fits contours as outer outlines, however well they determine it.
+/// The bar that has two contours as its outer outlines, however well they determine it.
 pub(crate) fn bar_start(
     points: [&[EdgePoint]; 2],
     p: [&Projection; 2],

@@ -1,7 +1,12 @@
-//! Round-bar rims: the fit of a torus to the outer and inner outlines of both views, started from the closed form of the outlines.
+//! Round-bar rims: the fit of a torus to the outer and inner outlines of both views, started from the closed form of
+//! the outlines.
 //!
-//! Both outlines of both views determine everything at the level of a plane circle. The outer outlines alone confuse core and bar radius
-//! and tip the normal: then the bar's diameter has to be known, or the result is refused by its own covariance.
+//! Both outlines in both views determine a bar as well as a plane circle. The outer outlines alone confuse core and
+//! bar radius and tilt the normal: the bar's diameter then has to be known, or the result is refused by its own
+//! covariance.
+//!
+//! [`torus`] is the model, `fit` and `result` reconstruct a bar from points. `search` looks for a bar in the images
+//! from one clicked outline per view; `outlines`, `limb`, `settle` and `found` are its steps.
 
 pub(crate) mod fit;
 pub(in crate::offline) mod found;

@@ -1,4 +1,4 @@
-//! BARRESULT
+//! From a fitted torus to a reconstruction: two-view test, side, covariance, report.
 
 use crate::offline::bar::fit::{BarFit, fit_bar};
 use crate::offline::rim::choice::{base_report, score, tolerable};
@@ -10,8 +10,8 @@ use crate::offline::types::projection::Projection;
 use crate::offline::types::{EdgePoint, Outline};
 use nalgebra::{Matrix2, SMatrix};
 
-/// How far an outline's ellipse may miss its epipolar tangents, pixels (one standard deviation).
-const OUTLINE_PX: f64 = 0.25;
+/// Standard deviation of the difference between an outline and its ellipse at the epipolar tangents, pixels.
+const OUTLINE_SIGMA_PX: f64 = 0.25;
 
 /// Reconstructs a round bar from its outlines in both views.
 ///
@@ -39,7 +39,10 @@ pub(crate) fn bar_alone(
     bar_result(&bar, scores, outer, points, p, options)
 }
 
-/// Turns a fit into a result, or refuses it: two-view test, side, covariance.
+/// Converts a fit to a reconstruction.
+///
+/// # Errors
+/// A [`Refusal`] when the two-view test, the side of the cameras or the covariance rejects it.
 pub(crate) fn bar_result(
     bar: &BarFit,
     scores: Vec<Score>,
@@ -101,7 +104,7 @@ fn check_two_views(
     // The epipolar planes that touch the bar touch both its outlines. The tangency gaps therefore close for a bar as
     // they do for a plane rim, up to the difference between an outline and the ellipse fitted to it.
     let open = (0..2).any(|k| {
-        let allowed = outer.gap_sigma_px[k].hypot(options.calibration_px).hypot(OUTLINE_PX);
+        let allowed = outer.gap_sigma_px[k].hypot(options.calibration_px).hypot(OUTLINE_SIGMA_PX);
         outer.gap_px[k].abs() > options.gate_sigmas * allowed
     });
     if open || bar.excess > bar.limit {

@@ -1,4 +1,4 @@
-//! JUDGED
+//! Two contours weighed as images of one plane rim.
 
 use crate::offline::contour::{Contour, ViewEdges, separate_pair};
 use crate::offline::correspondence::rig_error::RigError;
@@ -8,8 +8,8 @@ use crate::offline::rim::planar::{Analysis, analyse};
 use crate::offline::rim::refusal::Refusal;
 use crate::offline::types::Outline;
 
-/// A hand's click is off by so many pixels (the scale of an exponential).
-const CLICK_PX: f64 = 2.0;
+/// Scale of the exponential distribution of a click's distance from the contour, pixels.
+const CLICK_SCALE_PX: f64 = 2.0;
 
 /// Two contours with their plane models.
 pub(super) struct Judged {
@@ -29,7 +29,7 @@ impl Judged {
 
     /// Probability that the contours are one plane rim.
     pub(super) fn rim(&self) -> f64 {
-        // Nothing to hold it against is no evidence.
+        // Without an alternative there is no evidence.
         if !self.models.iter().any(|m| m.model == Model::Unrelated) {
             return 0.0;
         }
@@ -41,7 +41,7 @@ impl Judged {
         plane.max_by(|a, b| a.log.total_cmp(&b.log))
     }
 
-    /// Logarithm of the plane models' weight.
+    /// Log evidence of the best plane model.
     pub(super) fn log_rim(&self) -> f64 {
         self.best().map_or(f64::NEG_INFINITY, |b| b.log)
     }
@@ -58,7 +58,7 @@ impl Judged {
     pub(super) fn refusal(&self, rig: &RigError) -> Refusal {
         if self.probability(Model::Opposite) > 0.5 {
             return Refusal::OppositeSides {
-                why: "the plane between the cameras carries a circle there, the one before them none",
+                why: "the plane between the cameras carries a circle, the plane in front of them does not",
             };
         }
         Refusal::Different { gap_px: self.analysis.gap_px, probability: 1.0 - self.rim(), rig_px: rig.unknown_px() }
@@ -85,6 +85,6 @@ pub(super) fn judge(
     if out.best().is_none() {
         return Err(out.analysis.no_rim());
     }
-    out.score = -cost / CLICK_PX + out.rim().max(f64::MIN_POSITIVE).ln();
+    out.score = -cost / CLICK_SCALE_PX + out.rim().max(f64::MIN_POSITIVE).ln();
     Ok(out)
 }

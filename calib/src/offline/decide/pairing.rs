@@ -1,10 +1,12 @@
 //! Which contours of the two views are images of one rim, and of what kind of rim.
 //!
-//! Each view's selection gives a few contours, likeliest first. Every pair is weighed by the likelihood: circle,
-//! ellipse, two contours that have nothing to do with each other. For the likeliest pair a round bar with the clicked
-//! outline is looked for, and weighed on all four outlines against a flat ring. A model is accepted when everything
-//! that would lead to another grasp is out of the question ([`MOST_WRONG`]); otherwise the refusal names what could
-//! not be excluded.
+//! Each view's selection gives several candidate contours, most likely first. Every pair is weighed by the likelihood
+//! as circle, ellipse, or two unrelated contours. For the most likely pair a round bar with the clicked outline is
+//! searched, and weighed on all four outlines against a flat ring. A model is accepted when the total probability of
+//! models that lead to another grasp is small ([`MAX_WRONG`]); otherwise the refusal names the model that could not be
+//! excluded.
+//!
+//! [`MAX_WRONG`]: crate::offline::decide::bar_or_plane::MAX_WRONG
 
 use crate::offline::contour::ViewEdges;
 use crate::offline::contour::select::Candidate;
@@ -17,10 +19,10 @@ use crate::offline::rim::refusal::Refusal;
 
 pub use crate::offline::decide::bar_or_plane::Pair;
 
-/// A refusal that knows whether the same contours would do with the views swapped.
+/// A refusal, and whether the same contours fit with the views exchanged.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Unpaired {
-    /// Why the likeliest pair was refused.
+    /// Why the most likely pair was refused.
     pub refusal: Refusal,
     /// Whether a pair is accepted when left and right are exchanged.
     pub swapped_fits: bool,
@@ -32,15 +34,18 @@ impl From<Refusal> for Unpaired {
     }
 }
 
-/// What a difference of the brighter side costs, pixels of click distance: two images of one edge hardly ever differ
-/// in it, except against another background.
-const OTHER_SIDE: f64 = 12.0;
-/// What lies this much farther from the clicks than an accepted pair was not meant, pixels.
-const FARTHER_PX: f64 = 6.0;
-/// How many accepted pairs are compared; the two edges of a painted line are the usual case.
-const COMPARED: usize = 3;
+/// Cost of a pair with opposite brighter sides, pixels of click distance: two images of one edge hardly ever differ in
+/// it, except against different backgrounds.
+const OPPOSITE_SIDE_COST_PX: f64 = 12.0;
+/// Largest cost of a further pair above the cheapest accepted one, pixels: costlier pairs were not meant.
+const MAX_EXTRA_COST_PX: f64 = 6.0;
+/// Largest number of accepted pairs that are compared; the two edges of a painted line are the usual case.
+const MAX_COMPARED: usize = 3;
 
-/// Finds the likeliest pair that is the image of one rim. `views` are where the candidates come from.
+/// Finds the most likely pair that is the image of one rim. `views` are the views of the candidates.
+///
+/// # Errors
+/// [`Unpaired`] with the reason why the most likely pair was refused.
 pub fn pair(
     views: [&ViewEdges<'_>; 2],
     candidates: [&[Candidate]; 2],
@@ -51,8 +56,8 @@ pub fn pair(
     let mut first: Option<Refusal> = None;
     let mut accepted: Vec<Judged> = Vec::new();
     for (tried, (cost, l, r)) in order.iter().enumerate() {
-        let enough = accepted.iter().map(|a| a.cost).reduce(f64::min).is_some_and(|c| *cost > c + FARTHER_PX);
-        if accepted.len() >= COMPARED || enough {
+        let enough = accepted.iter().map(|a| a.cost).reduce(f64::min).is_some_and(|c| *cost > c + MAX_EXTRA_COST_PX);
+        if accepted.len() >= MAX_COMPARED || enough {
             break;
         }
         match judge(views, [&l.contour, &r.contour], (*cost, tried), rig, options) {
@@ -62,8 +67,8 @@ pub fn pair(
         }
     }
     let best = accepted.into_iter().max_by(|a, b| a.score.total_cmp(&b.score));
-    let decided = bar_or_plane(views, &order, best, rig, options);
-    let refusal = match decided {
+    let decision = bar_or_plane(views, &order, best, rig, options);
+    let refusal = match decision {
         Ok(Some(pair)) => {
             let r = &pair.reconstruction;
             tolerable_in_images(r, options)?;
@@ -83,7 +88,7 @@ fn in_order<'a>(candidates: [&'a [Candidate]; 2]) -> Ordered<'a> {
     let mut order = Vec::new();
     for l in candidates[0] {
         for r in candidates[1] {
-            let side = if l.contour.bright_inside == r.contour.bright_inside { 0.0 } else { OTHER_SIDE };
+            let side = if l.contour.bright_inside == r.contour.bright_inside { 0.0 } else { OPPOSITE_SIDE_COST_PX };
             order.push((l.cost + r.cost + side, l, r));
         }
     }

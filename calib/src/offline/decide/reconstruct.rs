@@ -1,4 +1,5 @@
-//! From edge points in two views to a rim in space: the chain of section 4, refined, with the model chosen and the doubts spelt out.
+//! From edge points in two views to a rim in space, without images: the chain of section 4, refined, with the model
+//! chosen and its uncertainty.
 
 use crate::offline::bar::fit::fit_bar;
 use crate::offline::bar::result::{bar_alone, bar_result};
@@ -14,8 +15,8 @@ use crate::offline::types::{EdgePoint, Outline};
 
 /// Reconstructs a rim from the edge points of both views.
 ///
-/// Points are pixels without distortion; matrices in any length unit and frame, of any scale and sign. Points of the inner outline
-/// matter to the round-bar model only.
+/// Points are undistorted pixels. The matrices may use any length unit and frame, and any scale and sign. Points of
+/// the inner outline are used by the round-bar model only.
 ///
 /// # Errors
 /// A [`Refusal`] that says what is wrong and what to change. Never panics, whatever the input.
@@ -47,8 +48,8 @@ fn any_model(
     let inner = points.map(|v| v.iter().filter(|q| q.outline == Outline::Inner).copied().collect::<Vec<_>>());
     let both = inner.iter().all(|v| v.len() >= 10);
     let flat = plane(a, points, p, options);
-    // One outline without the bar's diameter: a bar would only add a parameter that it cannot determine, and with it the freedom to
-    // explain two contours that are no pair.
+    // One outline without the bar's diameter: a bar would only add a parameter that the points do not determine, and
+    // with it the freedom to explain two contours that do not match.
     if !both && options.bar_diameter.is_none() {
         return flat;
     }
@@ -62,7 +63,8 @@ fn any_model(
     };
     let Ok(flat) = flat else {
         let result = bar_result(&bar, vec![bar_scored(bar.noise)], a, points, p, options);
-        // Neither: the plane's words are about the contours, the bar's only matter where it fits the points.
+        // Neither fits: the refusal of the plane model describes the contours, that of the bar matters only where it
+        // fits the points.
         return match (flat, result) {
             (_, Ok(r)) => Ok(r),
             (_, Err(e @ Refusal::BarUndetermined { .. })) => Err(e),
@@ -70,7 +72,7 @@ fn any_model(
             (Ok(r), Err(_)) => Ok(r),
         };
     };
-    // The hole of a flat ring is a rim of its own, with as many parameters again.
+    // The hole of a flat ring is a second rim, with its own parameters.
     let hole = if both { analyse([&inner[0], &inner[1]], p, options).ok() } else { None };
     let hole_fit = hole.as_ref().and_then(|h| choose_plane_model(h, RimChoice::Edge, options).ok());
     let own = scaled(&flat.report.residuals, points, |o| o == Outline::Outer);
@@ -104,16 +106,17 @@ fn any_model(
     Ok(flat)
 }
 
-/// Residuals in units of sigma of the points whose outline is wanted.
-fn scaled(residuals: &[Vec<f64>; 2], points: [&[EdgePoint]; 2], wanted: impl Fn(Outline) -> bool) -> Vec<f64> {
+/// Residuals in units of sigma of the points on the selected outlines.
+fn scaled(residuals: &[Vec<f64>; 2], points: [&[EdgePoint]; 2], selected: impl Fn(Outline) -> bool) -> Vec<f64> {
     let mut out = Vec::new();
     for k in 0..2 {
-        out.extend(residuals[k].iter().zip(points[k]).filter(|(_, q)| wanted(q.outline)).map(|(r, q)| r / q.sigma));
+        out.extend(residuals[k].iter().zip(points[k]).filter(|(_, q)| selected(q.outline)).map(|(r, q)| r / q.sigma));
     }
     out
 }
 
-/// Sum of squares with every residual cut off at the outlier gate, so that models with different outliers can be compared.
+/// Sum of squares with every residual truncated at the outlier gate, so that models with different outliers can be
+/// compared.
 fn truncated(r: &[f64], noise: f64) -> f64 {
     let most = GATE * noise;
     r.iter().map(|x| if x.is_finite() { (x * x).min(most * most) } else { most * most }).sum()

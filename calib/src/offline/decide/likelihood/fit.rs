@@ -1,4 +1,4 @@
-//! FITL
+//! The fit of a hypothesis: Gauss-Newton under the likelihood, for the rig as given and with its error unknown.
 
 use super::linear::Linear;
 use super::model::{Fitted, Hypothesis, Stretch};
@@ -7,28 +7,29 @@ use super::solve::{NO_WAVES, Solved, Sums};
 use crate::offline::correspondence::rig_error::RigError;
 use nalgebra::{DMatrix, DVector};
 
-/// Gauss-Newton rounds at most, and the step, in standard deviations of the answer, from which it has converged.
-const ROUNDS: usize = 14;
-const CONVERGED: f64 = 0.05;
+/// Largest number of Gauss-Newton iterations.
+const MAX_ITERATIONS: usize = 14;
+/// Step below which the fit has converged, standard deviations of the result.
+const CONVERGED_SIGMAS: f64 = 0.05;
 
-/// Part of each contour that a model has to explain: the rest is hidden or somebody else's.
-const EXPLAINED: f64 = 0.5;
+/// Smallest fraction of each contour that a model has to explain: the rest is hidden or belongs to something else.
+const MIN_EXPLAINED: f64 = 0.5;
 
 fn explains(stretches: &[Stretch], used: &[bool]) -> bool {
     let mut next = used.iter();
     stretches.iter().all(|s| {
         let kept = next.by_ref().take(s.points.len()).filter(|u| **u).count();
-        kept as f64 >= EXPLAINED * s.points.len() as f64
+        kept as f64 >= MIN_EXPLAINED * s.points.len() as f64
     })
 }
 
-/// Fits a hypothesis to contours. `None` where it leads nowhere (a shape collapses, a point has no residual).
+/// Fits a hypothesis to contours. `None` where the fit fails (a shape collapses, a point has no residual).
 ///
-/// A rig file is right as it stands, or it has an error of which the images of the pair leave a part open; the
-/// matches say which of both is the likelier ([`RigError::log_odds_given`]), and so do the contours. The evidence is
-/// that of the mixture. The estimate is that of the likelier: an error that is not there would only let the noise of
-/// matches and edges into directions that a good rig determines better. The covariance is that of the unknown rig,
-/// taken about the estimate, since a rig that seems right may still be wrong where nothing shows it.
+/// A rig file is exact, or it has an error that the images leave partly undetermined. The matches give the odds of the
+/// two ([`RigError::log_odds_given`]), and so do the contours. The evidence is that of the mixture. The estimate is
+/// that of the more likely case: an error that does not exist would only let the noise of matches and edges into
+/// directions that a good rig determines better. The covariance is that of the unknown rig, taken about the estimate,
+/// since a rig that seems exact may still be wrong in directions that are not observed.
 pub(in crate::offline) fn fit(hypothesis: &Hypothesis, stretches: &[Stretch], rig: &RigError) -> Option<Fitted> {
     let free = fit_rig(hypothesis, stretches, rig)?;
     let least_squares = || free.about(free.fitted.clone(), free.fitted.phi.clone());
@@ -38,7 +39,7 @@ pub(in crate::offline) fn fit(hypothesis: &Hypothesis, stretches: &[Stretch], ri
     let start = Hypothesis { shapes: free.fitted.shapes.clone(), ..hypothesis.clone() };
     let held = |phi: &[f64]| fit_rig(&start, stretches, &rig.held(phi)).map(|f| f.fitted);
     let Some(given) = held(rig.given()) else { return Some(least_squares()) };
-    // Weights of both, whose sum is one.
+    // Log weights of both cases; the weights add up to one.
     let odds = rig.log_odds_given();
     let by_odds = |log: f64| -(1.0 + log.exp()).ln();
     let (a, b) = (free.fitted.log_evidence + by_odds(odds), given.log_evidence + by_odds(-odds));
@@ -46,23 +47,24 @@ pub(in crate::offline) fn fit(hypothesis: &Hypothesis, stretches: &[Stretch], ri
     let (estimate, phi) = if a < b {
         (given, DVector::from_column_slice(rig.given()))
     } else {
-        // Smooth errors of the edges look like errors of the rig, so that the rig is estimated with the waves.
+        // Smooth errors of the edges look like errors of the rig, so that the rig is estimated together with the
+        // waves.
         let seen = &free.fitted.phi + free.step.rows(free.fitted.parameters, rig.modes.len());
-        let Some(put_right) = held(seen.as_slice()) else { return Some(least_squares()) };
-        (put_right, seen)
+        let Some(corrected) = held(seen.as_slice()) else { return Some(least_squares()) };
+        (corrected, seen)
     };
     Some(Fitted { log_evidence, ..free.about(estimate, phi) })
 }
 
-/// A fit with everything unknown: its covariance about the solution with waves, which is a step away from the least
-/// squares of the shapes.
+/// A fit with everything unknown. Its covariance is taken about the solution with waves, which is one step away from
+/// the least squares of the shapes.
 struct Free {
     fitted: Fitted,
     step: DVector<f64>,
 }
 
 impl Free {
-    /// Another estimate with this fit's covariance, taken about it.
+    /// Another estimate with this fit's covariance, taken about that estimate.
     fn about(&self, estimate: Fitted, phi: DVector<f64>) -> Fitted {
         let free = &self.fitted;
         let by_shape = match (free.shapes.first(), estimate.shapes.first()) {
@@ -81,17 +83,16 @@ fn fit_rig(hypothesis: &Hypothesis, stretches: &[Stretch], rig: &RigError) -> Op
     let mut phi = DVector::<f64>::zeros(rig.modes.len());
     let mut displaced = vec![0.0; hypothesis.displacements()];
     let mut kappa = 1.0;
-    for round in 0..ROUNDS {
+    for round in 0..MAX_ITERATIONS {
         let linear = Linear::new(hypothesis, &shapes, (&phi, &displaced), stretches, rig)?;
         let used = linear.used(kappa, round);
         let sums = Sums::new(&linear, &used);
-        // The estimate is least squares without the waves; what they would move it by goes into its covariance. On
-        // real edges, which have more to them than a few waves, it is the better of the two.
+        // The estimate is least squares without the waves; their effect on it goes into its covariance. On real edges,
+        // whose errors have more components than a few waves, it is the better of the two.
         let solved = sums.solve(&linear, NO_WAVES, kappa)?;
         kappa = solved.kappa;
-        // Directions that hardly anything determines may creep on; the last round's answer is as good as the next
-        // one's.
-        if round + 1 == ROUNDS || round >= 2 && solved.size() < CONVERGED {
+        // Directions that are hardly determined may converge slowly; the last iteration is as good as the next.
+        if round + 1 == MAX_ITERATIONS || round >= 2 && solved.size() < CONVERGED_SIGMAS {
             if !explains(stretches, &used) {
                 return None;
             }
@@ -126,7 +127,7 @@ fn result(linear: &Linear, shapes: Vec<Shape>, phi: DVector<f64>, solved: &Solve
         phi,
         cov,
         parameters,
-        residuals: linear.places.iter().map(|p| p.residual).zip(used.iter().copied()).collect(),
+        residuals: linear.points.iter().map(|p| p.residual).zip(used.iter().copied()).collect(),
     };
     Free { fitted, step }
 }

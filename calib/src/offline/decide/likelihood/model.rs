@@ -1,4 +1,4 @@
-//! MODEL
+//! Input and result of the likelihood.
 
 use super::shape::Shape;
 use crate::offline::correspondence::rig_error::RigError;
@@ -6,9 +6,9 @@ use crate::offline::types::EdgePoint;
 use crate::offline::types::projection::Projection;
 use nalgebra::{DMatrix, DVector};
 
-/// A point farther from the outline than this, in its own standard deviations, is somebody else's and costs as much.
+/// Largest distance of an inlier from the outline, in its own standard deviations. An outlier costs as much.
 pub(in crate::offline) const OUTLIER_SIGMAS: f64 = 4.5;
-/// Its expected size, pixels, and how far that is off as a natural logarithm: detected edges show 0.03 to 0.15.
+/// Expected size of the smooth edge error, pixels.
 pub(super) const USUAL_WAVE_PX: f64 = 0.07;
 
 /// One contour's edge points.
@@ -18,8 +18,8 @@ pub(in crate::offline) struct Stretch {
     pub(in crate::offline) view: usize,
     /// The points.
     pub(in crate::offline) points: Vec<EdgePoint>,
-    /// Place of each round the contour, radians.
-    pub(in crate::offline) place: Vec<f64>,
+    /// Parameter of each point along the contour, radians.
+    pub(in crate::offline) parameter: Vec<f64>,
     /// Which of the shapes it belongs to.
     pub(in crate::offline) shape: usize,
 }
@@ -31,45 +31,44 @@ pub(in crate::offline) struct Fitted {
     pub(in crate::offline) shapes: Vec<Shape>,
     /// Logarithm of the evidence, up to a constant of the points.
     pub(in crate::offline) log_evidence: f64,
-    /// Squared residuals in their own covariance, priors included: chi-squared with about `dof` degrees of freedom
-    /// for a right model.
+    /// Squared residuals in their own covariance, priors included: chi-squared with about `dof` degrees of freedom for
+    /// a correct model.
     pub(in crate::offline) chi2: f64,
     /// Degrees of freedom.
     pub(in crate::offline) dof: f64,
-    /// Noise of the points in units of their own sigmas.
+    /// Noise of the points, in units of their own sigmas.
     pub(in crate::offline) kappa: f64,
     /// Size of the smooth edge error, pixels.
     pub(in crate::offline) wave_px: f64,
-    /// Expected rig error in units of the modes.
+    /// Expected error of the rig, in units of the modes.
     pub(in crate::offline) phi: DVector<f64>,
-    /// Covariance of the first shape (centre, normal in `frame_of`, shape; natural units) and of the rig's modes
-    /// after it.
+    /// Covariance of the first shape (centre, normal in `frame_of`, shape; natural units), followed by the modes of
+    /// the rig.
     pub(in crate::offline) cov: DMatrix<f64>,
     /// Number of the first shape's parameters.
     pub(in crate::offline) parameters: usize,
-    /// Residual of each point with the estimated rig error put right, pixels, and whether it was used; in the
-    /// stretches' order.
+    /// Residual of each point for the corrected rig, pixels, and whether it was used; in the order of the stretches.
     pub(in crate::offline) residuals: Vec<(f64, bool)>,
 }
 
-/// A hypothesis about some contours: shapes, and whether the right contour is another one than the left.
+/// A hypothesis about several contours: their shapes, and whether the right contour is another one than the left.
 #[derive(Clone, Debug)]
 pub(in crate::offline) struct Hypothesis {
     /// The shapes that the stretches belong to.
     pub(in crate::offline) shapes: Vec<Shape>,
-    /// Standard deviation, pixels, of how far a contour of the right image lies from where the left one's shape puts
-    /// it, across and in height over the epipolar lines. `None` if both are images of one shape.
+    /// Standard deviation, pixels, of the displacement of a contour in the right image from where the left one's shape
+    /// predicts it, across the epipolar lines and in height over them. `None` if both are images of one shape.
     pub(in crate::offline) unrelated_px: Option<f64>,
 }
 
 impl Hypothesis {
-    /// Number of parameters by which unrelated contours are displaced.
+    /// Number of parameters of that displacement.
     pub(super) fn displacements(&self) -> usize {
         if self.unrelated_px.is_some() { 2 * self.shapes.len() } else { 0 }
     }
 }
 
-/// A view's projection with the expected error of the modes put right.
+/// A view's projection corrected by the expected error of the modes.
 pub(in crate::offline) fn corrected(rig: &RigError, phi: &DVector<f64>, view: usize) -> Projection {
     let mut p = rig.p.get(view).copied().unwrap_or_default();
     for (mode, v) in rig.modes.iter().zip(phi.iter()) {
