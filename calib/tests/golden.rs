@@ -1,4 +1,4 @@
-//! The golden cases: every field of every case within the tolerances that the file states, whatever the names and the order.
+//! The golden cases: every field of every case within the tolerances stated in the file.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use serde_json::Value;

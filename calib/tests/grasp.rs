@@ -1,4 +1,5 @@
-//! The choice of the grasp on a rim: the free angle, the four positions, what hides marks, the turn and the path from the present pose.
+//! The choice of the grasp on a rim: the free angle, the four positions, hidden marks, the rotation and the path from
+//! the present pose.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::GripperFile;

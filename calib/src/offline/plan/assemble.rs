@@ -1,4 +1,4 @@
-//! ASSEMBLE
+//! Assembly of the plan: set-points, path check and plan file from a rim and a grasp.
 
 use crate::files::{GripperFile, PathRecord, PlanFile, RigFile, SourceRecord};
 use crate::offline::contour::Contour;
@@ -14,15 +14,15 @@ use graspd_rt::setpoint::SetPoint;
 /// A finished off-line stage.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// What goes into the plan file.
+    /// Contents of the plan file.
     pub file: PlanFile,
-    /// Its text, the same for the same input.
+    /// Text of the plan file; deterministic.
     pub text: String,
-    /// What goes to the loop.
+    /// The set-point for the loop.
     pub set_point: SetPoint,
     /// The contours used, left and right.
     pub contours: [Contour; 2],
-    /// The inner outlines of a round bar, left and right, where they were looked for and found.
+    /// The inner outlines of a round bar, left and right, where they were found.
     pub inner: [Option<Contour>; 2],
     /// The rim.
     pub reconstruction: Reconstruction,
@@ -30,7 +30,8 @@ pub struct Plan {
     pub grasp: Grasp,
 }
 
-/// Writes the text and reads it back as the loop would, so that a plan which `graspd run` would refuse is never handed out.
+/// Writes the text and reads it back as the loop does, so that a plan which `graspd run` would refuse is never
+/// returned.
 pub(super) fn finish(mut plan: Plan, rig: &RigFile, gripper: &GripperFile) -> Result<Plan, PlanError> {
     plan.text = plan.file.to_toml();
     let again = PlanFile::parse(&plan.text, "plan.toml")?;
@@ -57,7 +58,7 @@ pub(super) fn assemble(
         let [l, r] = fewest_on_the_way(&scene, &poses, 20);
         if l.0 < grasp::LEAST_MARKS && r.0 < grasp::LEAST_MARKS {
             warnings.push(format!(
-                "on the way from the present pose only {} and {} marks are seen (at {:.0} % and {:.0} % of it): start nearer, or move the rig",
+                "on the path from the present pose only {} and {} marks are visible (at {:.0} % and {:.0} % of it): start closer, or move the rig",
                 l.0,
                 r.0,
                 100.0 * l.1,

@@ -1,4 +1,4 @@
-//! ERR
+//! Why there is no plan.
 
 use crate::files::FileError;
 use crate::offline::contour::select::SelectError;
@@ -8,12 +8,12 @@ use crate::offline::rim::refusal::Refusal;
 /// Why there is no plan.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PlanError {
-    /// A file is wrong.
+    /// A file is invalid.
     #[error(transparent)]
     File(#[from] FileError),
-    /// An image's size is not the camera's.
+    /// Image size mismatch between an image and the rig file.
     #[error(
-        "the {view} image is {width}x{height}, but the rig's {view} camera is {rig_width}x{rig_height}: give the image of that camera, unscaled, or the rig file of this size"
+        "{view} image size mismatch: got {width}x{height}, the rig file expects {rig_width}x{rig_height}: give the unscaled image of the {view} camera, or the rig file for this size"
     )]
     ImageSize {
         /// "left" or "right".
@@ -27,37 +27,37 @@ pub enum PlanError {
         /// Height in the rig file.
         rig_height: u32,
     },
-    /// A selection leads nowhere.
+    /// A selection gives no contour.
     #[error(transparent)]
     Select(#[from] SelectError),
-    /// The views are swapped.
+    /// The views are swapped, by the contours.
     #[error(
-        "the views are swapped: the contours do not fit one rim as given ({as_given}), but do with left and right exchanged: exchange the two images, or the cameras in the rig file"
+        "the views are swapped: the contours fit one rim only with left and right exchanged (as given: {as_given}): exchange the two images, or the cameras in the rig file"
     )]
     Swapped {
-        /// Why they do not fit as given.
+        /// Why the contours do not fit as given.
         as_given: Refusal,
     },
-    /// The images are exchanged, by everything that is in them.
+    /// The views are swapped, by the spots of the images.
     #[error(
-        "the views are swapped: of the distinct spots of the images {exchanged} lie where the rig wants them with left and right exchanged, {as_given} as given: exchange the two images, or the cameras in the rig file"
+        "the views are swapped: {exchanged} distinctive spots of the images match the rig with left and right exchanged, {as_given} as given: exchange the two images, or the cameras in the rig file"
     )]
     Exchanged {
-        /// Spots that speak for the order as given.
+        /// Spots that match in the order as given.
         as_given: usize,
-        /// Spots that speak for the other.
+        /// Spots that match with left and right exchanged.
         exchanged: usize,
     },
-    /// No rim.
+    /// The selected contours give no rim.
     #[error(transparent)]
     Rim(#[from] Refusal),
-    /// No grasp.
+    /// The rim cannot be grasped.
     #[error(transparent)]
     Grasp(#[from] GraspError),
 }
 
 impl PlanError {
-    /// A word for machines.
+    /// The kind of error as a machine-readable name.
     pub fn kind(&self) -> &'static str {
         match self {
             Self::File(_) => "file",
@@ -69,7 +69,7 @@ impl PlanError {
         }
     }
 
-    /// Whether the input itself is wrong (as against a rim or a grasp that the tests refuse).
+    /// Whether the input is invalid (as opposed to a rim or a grasp that is refused).
     pub fn is_input(&self) -> bool {
         !matches!(self, Self::Rim(_) | Self::Grasp(_))
     }

@@ -1,4 +1,8 @@
-//! The whole off-line stage as one pure function: two images, what was selected in them, a rig and a gripper in; a plan or a reason out.
+//! The entire off-line stage as one pure function: two images, the selections in them, a rig and a gripper in; a plan
+//! or a reason out.
+//!
+//! `options` and `error` are its interface, [`Prepared`] holds what two images give whatever is selected, `assemble`
+//! and `records` write the plan file.
 
 mod assemble;
 mod error;

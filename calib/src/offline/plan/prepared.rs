@@ -1,4 +1,4 @@
-//! PREPARED
+//! Two images prepared for planning, and the steps from selections to a plan.
 
 use crate::files::{GripperFile, ImageRecord, RigFile, SeenRig, SelectionRecord};
 use crate::offline::contour::ViewEdges;
@@ -18,27 +18,34 @@ use crate::offline::plan::records::pair_of;
 use crate::offline::rim::refusal::Refusal;
 use graspd_rt::geom::View;
 
-/// How many contours of a view are tried against the other's.
-const CANDIDATES: usize = 5;
+/// Largest number of contours per view that are paired.
+const MAX_CANDIDATES: usize = 5;
 
-/// Two images with everything that a plan takes from them whatever is selected, so that several selections cost its making once.
+/// Two images with everything that a plan takes from them whatever is selected, so that several selections share its
+/// cost.
 #[derive(Debug)]
 pub struct Prepared<'a> {
     pub(super) edges: [ViewEdges<'a>; 2],
-    /// The rig as the images have it, and what stays unknown of it.
-    pub(super) seen: RigError,
+    /// The rig as estimated from the images, with its remaining uncertainty.
+    pub(super) rig_error: RigError,
     images: [&'a GreyImage; 2],
     rig: &'a RigFile,
     votes: Votes,
 }
 
 impl<'a> Prepared<'a> {
-    /// The same for a rig of the quality that its file states.
+    /// Prepares two images for a rig of the quality that its file states.
+    ///
+    /// # Errors
+    /// [`PlanError::ImageSize`].
     pub fn new(images: [&'a GreyImage; 2], rig: &'a RigFile) -> Result<Self, PlanError> {
         Self::with_prior(images, rig, &RigPrior(rig.error()))
     }
 
-    /// Checks the images' sizes, holds the images against the rig file, and finds their edges.
+    /// Checks the sizes of the images, estimates the error of the rig file from them, and detects their edges.
+    ///
+    /// # Errors
+    /// [`PlanError::ImageSize`].
     pub fn with_prior(images: [&'a GreyImage; 2], rig: &'a RigFile, prior: &RigPrior) -> Result<Self, PlanError> {
         for (view, image, name) in [(View::Left, images[0], "left"), (View::Right, images[1], "right")] {
             let c = rig.rig.camera(view);
@@ -56,19 +63,19 @@ impl<'a> Prepared<'a> {
         let p = View::BOTH.map(|v| projection(&rig.rig, v));
         let noise = images[0].noise().max(images[1].noise());
         let found = spots(images, [&lenses[0], &lenses[1]], [&p[0], &p[1]], noise);
-        let seen = RigError::observe(&rig.rig, prior, &found.matches);
-        let edges = View::BOTH.map(|v| ViewEdges::new(images[v.index()], seen.rig.camera(v)));
-        Ok(Self { edges, seen, images, rig, votes: found.votes })
+        let rig_error = RigError::observe(&rig.rig, prior, &found.matches);
+        let edges = View::BOTH.map(|v| ViewEdges::new(images[v.index()], rig_error.rig.camera(v)));
+        Ok(Self { edges, rig_error, images, rig, votes: found.votes })
     }
 
-    /// How the images' spots vote on their order.
+    /// Votes of the images' spots on their order.
     pub fn order(&self) -> Votes {
         self.votes
     }
 
-    /// How the images and the rig file agree.
+    /// The rig as estimated from the images, with its remaining uncertainty.
     pub fn rig_error(&self) -> &RigError {
-        &self.seen
+        &self.rig_error
     }
 
     /// Refuses images in the wrong order.
@@ -88,14 +95,14 @@ impl<'a> Prepared<'a> {
         options: &PlanOptions,
     ) -> Result<Plan, PlanError> {
         let [l, r] = &self.edges;
-        let left = select::contours(View::Left, l, selections[0], CANDIDATES);
-        let right = select::contours(View::Right, r, selections[1], CANDIDATES);
+        let left = select::contours(View::Left, l, selections[0], MAX_CANDIDATES);
+        let right = select::contours(View::Right, r, selections[1], MAX_CANDIDATES);
         let (left, right) = match (left, right) {
             (Ok(l), Ok(r)) => (l, r),
             (Err(e), _) | (_, Err(e)) => {
                 self.in_order()?;
                 return Err(self
-                    .crossed(selections, options)
+                    .swapped(selections, options)
                     .map_or(PlanError::Select(e), |as_given| PlanError::Swapped { as_given }));
             }
         };
@@ -105,13 +112,16 @@ impl<'a> Prepared<'a> {
         });
         from_candidates(self, [&left, &right], record, gripper, options).map_err(|e| match e {
             PlanError::Rim(rim) => self
-                .crossed(selections, options)
+                .swapped(selections, options)
                 .map_or(PlanError::Rim(rim), |as_given| PlanError::Swapped { as_given }),
             other => other,
         })
     }
 
-    /// Ellipses proposed without a selection, ranked, at most `most`. `watch` is told what part of the work is done.
+    /// Rims proposed without a selection, ranked, at most `most`. `watch` receives the completed fraction.
+    ///
+    /// # Errors
+    /// [`PlanError::Exchanged`].
     pub fn proposals(
         &self,
         options: &PlanOptions,
@@ -119,7 +129,7 @@ impl<'a> Prepared<'a> {
         watch: &mut dyn FnMut(f64),
     ) -> Result<Vec<Proposal>, PlanError> {
         self.in_order()?;
-        Ok(propose(&self.edges, [&self.seen.p[0], &self.seen.p[1]], &options.rim, most, watch))
+        Ok(propose(&self.edges, [&self.rig_error.p[0], &self.rig_error.p[1]], &options.rim, most, watch))
     }
 
     /// Plans a grasp on a proposal.
@@ -137,15 +147,16 @@ impl<'a> Prepared<'a> {
         from_candidates(self, [&left, &right], record, gripper, options)
     }
 
-    /// Why the contours do not fit as given, where images too plain to tell their order do fit with selections and cameras exchanged.
-    fn crossed(&self, selections: [&Selection; 2], options: &PlanOptions) -> Option<Refusal> {
+    /// Why the contours do not fit as given, if the spots do not determine the order of the images and the contours
+    /// fit with selections and cameras exchanged.
+    fn swapped(&self, selections: [&Selection; 2], options: &PlanOptions) -> Option<Refusal> {
         if self.order().are_as_given() {
             return None;
         }
         let [l, r] = &self.edges;
         let left = select::contours(View::Left, l, selections[1], 2).ok()?;
         let right = select::contours(View::Right, r, selections[0], 2).ok()?;
-        pairing::pair([l, r], [&left, &right], &self.seen, &options.rim)
+        pairing::pair([l, r], [&left, &right], &self.rig_error, &options.rim)
             .err()
             .filter(|u| u.swapped_fits)
             .map(|u| u.refusal)
@@ -171,11 +182,11 @@ fn from_candidates(
     gripper: &GripperFile,
     options: &PlanOptions,
 ) -> Result<Plan, PlanError> {
-    // A rim near the middle can be reconstructed either way round; the rest of the images tells.
+    // A rim near the middle can be reconstructed in either order; the rest of the images decides.
     views.in_order()?;
     let (images, rig) = (views.images, views.rig);
     let found =
-        pairing::pair([&views.edges[0], &views.edges[1]], candidates, &views.seen, &options.rim).map_err(|u| {
+        pairing::pair([&views.edges[0], &views.edges[1]], candidates, &views.rig_error, &options.rim).map_err(|u| {
             if u.swapped_fits && !views.order().are_as_given() {
                 PlanError::Swapped { as_given: u.refusal }
             } else {
@@ -183,7 +194,7 @@ fn from_candidates(
             }
         })?;
     let Pair { contours, inner, reconstruction, rig: seen, .. } = found;
-    let matches = views.seen.agreement;
+    let matches = views.rig_error.agreement;
     let grasp = grasp::choose(&seen, gripper, &reconstruction, &options.approach)?;
     let mut plan = assemble((contours, inner), reconstruction, grasp, (rig, &seen), gripper, options);
     plan.file.images = Some(pair_of(images.map(|p| ImageRecord {

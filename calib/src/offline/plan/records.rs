@@ -1,4 +1,4 @@
-//! RECORDS
+//! The records of the plan file.
 
 use crate::files::{ConeRecord, EdgeRecord, GoalRecord, MarkRecord, ModelRecord, ObjectRecord, PoseRecord, ViewPair};
 use crate::offline::contour::Contour;
@@ -35,7 +35,7 @@ pub(super) fn edge_record(c: &Contour) -> EdgeRecord {
     }
 }
 
-/// A model's name as files and people read it.
+/// Name of a model in files and messages.
 pub fn model_name(m: RimModel) -> &'static str {
     match m {
         RimModel::Circle => "circle",
@@ -53,7 +53,8 @@ pub(in crate::offline) fn worst<const N: usize>(m: &nalgebra::SMatrix<f64, N, N>
 where
     nalgebra::Const<N>: nalgebra::DimName,
 {
-    // The largest eigenvalue of a small symmetric matrix by squaring: exact enough in sixty steps whatever its gap.
+    // The largest eigenvalue of a small symmetric matrix by power iteration: sixty steps are accurate enough whatever
+    // its gap.
     let mut v = nalgebra::SVector::<f64, N>::from_fn(|i, _| 1.0 + 0.1 * i as f64);
     for _ in 0..60 {
         let w = m * v;
@@ -88,7 +89,7 @@ pub(super) fn object_record(r: &Reconstruction) -> ObjectRecord {
     }
 }
 
-/// A number for a file: what is not finite is written as a very large one, which TOML readers of every language take.
+/// A number for a file: values that are not finite are written as 1e300, which TOML readers of every language accept.
 fn finite(v: f64) -> f64 {
     if v.is_finite() { v } else { 1e300 }
 }
@@ -121,7 +122,7 @@ pub(super) fn model_records(r: &Reconstruction) -> Vec<ModelRecord> {
                 (true, _) => "chosen".to_owned(),
                 (false, Some(why)) => why.to_owned(),
                 (false, None) if s.bic > best => format!("criterion larger by {:.1}", s.bic - best),
-                (false, None) => "not asked for".to_owned(),
+                (false, None) => "not requested".to_owned(),
             },
         })
         .collect()
