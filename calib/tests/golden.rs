@@ -171,8 +171,9 @@ fn every_golden_case_is_within_its_tolerances() {
     println!("closest to its tolerance: {} at {:.3} of it", w.1, w.0);
 }
 
-/// Random rigs (verged, parallel, skew, rolled, portrait, any frame, unit and scale of P), rims and noise, with what the numpy reference
-/// answers; made beside it, so that the golden file is not all that the chain was ever held against.
+/// Random rigs (verged, parallel, skew, rolled, portrait, any frame, unit and scale of P), rims and noise, with what
+/// the numpy reference answers; made independently, so that the golden file is not all that the chain was ever held
+/// against.
 #[test]
 fn random_rigs_agree_with_the_reference() {
     const RANDOM: &str = include_str!("data/conic_random.json");

@@ -75,7 +75,7 @@ fn at(scene: &Scene<'_>, r: &Reconstruction, a: &Approach, phi: f64) -> ([usize;
 }
 
 #[test]
-fn the_free_angle_is_the_best_of_the_whole_turn_for_the_better_view() {
+fn the_free_angle_is_the_best_of_the_full_turn_for_the_better_view() {
     let g = gripper(0.7, "[[body]]\ncentre_m = [0.0, 0.0, -0.1]\nhalf_size_m = [0.06, 0.02, 0.01]\n");
     for k in 0..8 {
         let r = rim(0.3 + 0.05 * f64::from(k), f64::from(k) * 0.8, 0.07, 0.07);
@@ -108,7 +108,7 @@ fn the_free_angle_is_the_best_of_the_whole_turn_for_the_better_view() {
 }
 
 #[test]
-fn marks_that_look_alike_at_every_angle_leave_the_smallest_turn() {
+fn a_flat_criterion_gives_the_smallest_turn() {
     let g = gripper(0.0, "");
     let r = rim(0.35, 0.9, 0.07, 0.07);
     let free = choose(&rig(), &g, &r, &Approach::default()).unwrap();
@@ -199,7 +199,7 @@ fn the_gripper_and_the_object_hide_marks() {
 }
 
 #[test]
-fn the_path_tells_where_it_loses_marks() {
+fn the_path_reports_where_marks_are_lost() {
     let r = rim(0.3, 0.4, 0.07, 0.07);
     let (rig, g) = (rig(), gripper(0.0, ""));
     let scene = Scene::new(&rig, &g, 0.15, None);
@@ -207,7 +207,7 @@ fn the_path_tells_where_it_loses_marks() {
     let pregrasp = gripper_pose(&r.rim, &direction(&r.rim, 0.3), 0.12);
     let near = pregrasp * Pose::translation(0.02, 0.01, -0.1);
     assert_eq!(fewest_on_the_way(&scene, &[near, pregrasp, grasp], 20).map(|f| f.0), [5, 5]);
-    // Turned away at the start: nothing is seen there, and it says where.
+    // Turned away at the start: no mark is visible there, and the fraction says where.
     let away = near * Pose::rotation(Vec3::x() * 2.2);
     for (n, fraction) in fewest_on_the_way(&scene, &[away, pregrasp, grasp], 20) {
         assert!(n < LEAST_MARKS && fraction < 0.1, "{n} {fraction}");

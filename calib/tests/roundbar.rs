@@ -29,9 +29,9 @@ fn wheel(random: &mut Random, core: f64, bar: f64, tilt_deg: f64, sigma: f64) ->
     let mut outer = [Vec::new(), Vec::new()];
     let mut inner = [Vec::new(), Vec::new()];
     for k in 0..2 {
-        let centre_k = camera_centre(&p[k]).unwrap();
+        let camera = camera_centre(&p[k]).unwrap();
         for i in 0..200 {
-            let [out, hole] = outline(&torus, &centre_k, TAU * f64::from(i) / 200.0).unwrap();
+            let [out, hole] = outline(&torus, &camera, TAU * f64::from(i) / 200.0).unwrap();
             let (a, b) = (project(&p[k], &out), project(&p[k], &hole));
             let mut n = || sigma * random.normal();
             outer[k].push(EdgePoint::new(a.x + n(), a.y + n(), SIGMA));

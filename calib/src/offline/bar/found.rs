@@ -4,14 +4,15 @@ use crate::offline::contour::Contour;
 use crate::offline::rim::model::Reconstruction;
 use crate::offline::types::{EdgePoint, Outline};
 
-/// Largest root mean square distance of an outline's edges from the bar, pixels: beyond it another contour was followed.
+/// Largest root mean square distance of an outline's edges from the bar, pixels: beyond it another contour was
+/// followed.
 const MAX_SCATTER_PX: f64 = 0.45;
 /// The limit for an outline of which almost nothing is visible, pixels: fewer edges have to be closer to the bar.
 const MAX_SCATTER_AT_ZERO_PX: f64 = 0.1;
 /// Increase of that limit with the visible fraction of the outline, pixels.
 const MAX_SCATTER_PER_FRACTION_PX: f64 = 0.75;
-/// Smallest fraction of each outline that has to lie on the bar. Hub and spokes of a small wheel leave little of an inner
-/// outline, which is enough when the other three outlines are visible.
+/// Smallest fraction of each outline that has to lie on the bar. Hub and spokes of a small wheel leave little of an
+/// inner outline, which is enough when the other three outlines are visible.
 const MIN_FRACTION: f64 = 0.15;
 /// Largest noise about the fitted bar, in units of the edges' own standard deviations.
 const MAX_NOISE: f64 = 2.2;

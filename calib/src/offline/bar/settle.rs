@@ -30,8 +30,8 @@ const THICKER_STEPS: i32 = 8;
 const MIN_THICKER_LIKELIHOOD: f64 = 0.7;
 /// Standard deviation added to a limb whose fall-off is disturbed by something beside it, pixels.
 const DISTURBED_LIMB_SIGMA_PX: f64 = 0.25;
-/// Largest noise of detected edges about a bar that is refined further, in the edges' own standard deviations: limbs beside
-/// paint reach seven.
+/// Largest noise of detected edges about a bar that is refined further, in the edges' own standard deviations: limbs
+/// beside paint reach seven.
 const MAX_DETECTED_NOISE: f64 = 8.0;
 /// Corners of a predicted outline's polygon.
 const CORNERS: usize = 720;

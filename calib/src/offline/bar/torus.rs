@@ -170,7 +170,8 @@ pub(crate) struct TorusFit {
     /// Weighted sum of squared residuals over the rays kept.
     pub(crate) chi2: f64,
     pub(crate) parameters: usize,
-    /// Inverse normal matrix of centre, normal (columns of [`frame_of`]), and the free radii; `None` when it is singular.
+    /// Inverse normal matrix of centre, normal (columns of [`frame_of`]), and the free radii; `None` when it is
+    /// singular.
     pub(crate) cofactor: Option<SMatrix<f64, 7, 7>>,
 }
 

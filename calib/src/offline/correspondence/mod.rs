@@ -6,6 +6,7 @@
 //! conics. This folder does not know rims or bars.
 
 pub mod epipolar;
+mod patches;
 pub(in crate::offline) mod refine;
 pub mod rig_error;
 mod rig_fit;

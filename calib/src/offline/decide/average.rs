@@ -65,9 +65,9 @@ mod tests {
         let truth = rim_tilted(Vector3::new(0.02, -0.05, 1.5), 0.5, 1.0, 0.075, 0.0745);
         let mut random = Random::new(9);
         let points = [0, 1].map(|v| {
-            let place =
+            let noisy =
                 |uv: nalgebra::Vector2<f64>, r: &mut Random| uv + nalgebra::Vector2::new(r.normal(), r.normal()) * 0.2;
-            let one = |uv, r: &mut Random| EdgePoint { uv: place(uv, r), sigma: 0.2, outline: Outline::Outer };
+            let one = |uv, r: &mut Random| EdgePoint { uv: noisy(uv, r), sigma: 0.2, outline: Outline::Outer };
             rim_points(&p[v], &truth, 200).into_iter().map(|uv| one(uv, &mut random)).collect::<Vec<_>>()
         });
         let fit = |rim| {

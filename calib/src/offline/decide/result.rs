@@ -14,7 +14,8 @@ use nalgebra::{DMatrix, Matrix2, Matrix2x3, Matrix3, SMatrix, SVector, Vector2, 
 
 /// Distance of a typical gripper's marks from the axis of the grasp, metres.
 const MARK_RADIUS_M: f64 = 0.05;
-/// Distance of the marks in front of the rim's plane, metres. Marks farther from the rim cancel less of its depth error.
+/// Distance of the marks in front of the rim's plane, metres. Marks farther from the rim cancel less of its depth
+/// error.
 const MARK_HEIGHT_M: f64 = 0.08;
 /// Number of marks on that circle.
 const MARKS: usize = 8;

@@ -134,10 +134,10 @@ mod tests {
     fn disc(side: usize, c: Pixel, radius: f64, noise: f64, seed: u64) -> GreyImage {
         const SUB: usize = 6;
         let n = side * SUB;
-        let place = |k: usize| (k as f64 + 0.5) / SUB as f64 - 0.5;
+        let position = |k: usize| (k as f64 + 0.5) / SUB as f64 - 0.5;
         let sharp: Vec<f32> = (0..n * n)
             .map(|i| {
-                let d = radius - (place(i % n) - c.x).hypot(place(i / n) - c.y);
+                let d = radius - (position(i % n) - c.x).hypot(position(i / n) - c.y);
                 (d * SUB as f64 + 0.5).clamp(0.0, 1.0) as f32
             })
             .collect();

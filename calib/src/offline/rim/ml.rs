@@ -34,8 +34,8 @@ pub struct MlFit {
     pub count: usize,
     /// Number of parameters: 6 or 8.
     pub parameters: usize,
-    /// Inverse normal matrix (times the noise variance: the covariance) of centre (length), normal (radians, columns `e1, e2` of
-    /// [`frame_of`] the normal) and shape: the radius, or `S00, S01, S11` (length) in axes `e1, e2`.
+    /// Inverse normal matrix (times the noise variance: the covariance) of centre (length), normal (radians, columns
+    /// `e1, e2` of [`frame_of`] the normal) and shape: the radius, or `S00, S01, S11` (length) in axes `e1, e2`.
     pub cofactor: SMatrix<f64, 8, 8>,
     /// Rows of the derivative of `(a, b)` by the shape's entries.
     axes_from_shape: SMatrix<f64, 2, 3>,

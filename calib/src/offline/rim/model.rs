@@ -202,7 +202,8 @@ pub struct Reconstruction {
     pub bar_radius: Option<f64>,
     /// Covariance of the centre, length units squared.
     pub cov_centre: Matrix3<f64>,
-    /// Covariance of the normal, radians squared, in the columns `e1, e2` of [`crate::offline::rim::circle::frame_of`] the normal.
+    /// Covariance of the normal, radians squared, in the columns `e1, e2` of [`crate::offline::rim::circle::frame_of`]
+    /// the normal.
     pub cov_normal: Matrix2<f64>,
     /// Cross-covariance of the centre (rows) and the normal (columns `e1, e2`).
     pub cov_centre_normal: Matrix3x2<f64>,

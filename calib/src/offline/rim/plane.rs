@@ -17,7 +17,8 @@ pub struct PlanePair {
     pub planes: [Vector4<f64>; 2],
     /// Parameter of the pencil.
     pub lambda: f64,
-    /// Largest eigenvalue that should be zero, over the smaller of the two others; 0 where rank 2 holds by construction.
+    /// Largest eigenvalue that should be zero, over the smaller of the two others; 0 where rank 2 holds by
+    /// construction.
     pub rank2: f64,
     /// Smaller over larger of the two non-zero eigenvalues.
     pub separation: f64,

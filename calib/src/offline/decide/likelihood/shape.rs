@@ -12,8 +12,8 @@ use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 
 /// Usual radius of a bar as a fraction of its core radius.
 const USUAL_BAR: f64 = 0.12;
-/// Standard deviation of the bar radius from the usual one, natural logarithm: hand wheels, handles and pipes lie between
-/// a thirtieth and a half.
+/// Standard deviation of the bar radius from the usual one, natural logarithm: hand wheels, handles and pipes lie
+/// between a thirtieth and a half.
 const BAR_SPREAD: f64 = 0.6;
 /// Largest number of parameters of a shape.
 pub(super) const PARAMETERS: usize = 8;
