@@ -1,14 +1,17 @@
-//! Time of the off-line stage's mathematics: `cargo bench -p graspd-calib --bench offline`. Prints; never judges.
+//! Run times of the off-line mathematics: `cargo bench -p graspd-calib --bench offline`. Prints figures; does not
+//! compare them with limits.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::offline::conic::{fit_direct, fit_ml};
+use graspd_calib::offline::decide::reconstruct::reconstruct;
 use graspd_calib::offline::rim::circle::extract;
-use graspd_calib::offline::rim::cone::{ConePair, project};
-use graspd_calib::offline::rim::model::{EdgePoint, Options, RimChoice, Scatter};
+use graspd_calib::offline::rim::cone::ConePair;
+use graspd_calib::offline::rim::model::{Options, RimChoice};
 use graspd_calib::offline::rim::planar::analyse;
 use graspd_calib::offline::rim::plane::polar;
-use graspd_calib::offline::rim::reconstruct::reconstruct;
 use graspd_calib::offline::rim::synthetic::{Random, rig, rim_point, rim_tilted};
+use graspd_calib::offline::types::projection::project;
+use graspd_calib::offline::types::{EdgePoint, Scatter};
 use nalgebra::Vector3;
 use std::hint::black_box;
 use std::time::Instant;
@@ -57,10 +60,10 @@ fn main() {
     time("fits, both closed forms, ML circle + ellipse, 2 x 200", 1000, || {
         black_box(analyse([&left, &right], [&p[0], &p[1]], black_box(&plain)).ok());
     });
-    time("whole reconstruction, no outlier search, 2 x 200", 1000, || {
+    time("full reconstruction, no outlier search, 2 x 200", 1000, || {
         black_box(reconstruct(&left, &p[0], &right, &p[1], black_box(&plain)).ok());
     });
-    time("whole reconstruction with outlier search, 2 x 200", 1000, || {
+    time("full reconstruction with outlier search, 2 x 200", 1000, || {
         black_box(reconstruct(&left, &p[0], &right, &p[1], black_box(&robust)).ok());
     });
 }

@@ -7,12 +7,14 @@ use crate::offline::conic::sampson::distance;
 use crate::offline::conic::{ellipse_of, fit_direct, fit_ml};
 use crate::offline::handle::visibility::{Eye, FlatMark};
 use crate::offline::handle::{grasp_circle, grasp_ellipse};
+use crate::offline::rim::choice::choose_plane_model;
 use crate::offline::rim::circle::{ClosedForm, vergence};
-use crate::offline::rim::cone::project;
 use crate::offline::rim::ml::MlFit;
-use crate::offline::rim::model::{EdgePoint, Ellipse2, Noise, Options, Projection, Rim, RimChoice, Scatter};
+use crate::offline::rim::model::{Noise, Options, Rim, RimChoice};
 use crate::offline::rim::planar::{Analysis, analyse};
-use crate::offline::rim::reconstruct::choose_plane_model;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::project;
+use crate::offline::types::{EdgePoint, Ellipse2, Scatter};
 use nalgebra::{Isometry3, Matrix2, Matrix3, Point3, Vector2, Vector3};
 use serde_json::{Map, Value, json};
 

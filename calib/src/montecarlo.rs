@@ -4,12 +4,14 @@
 //! noise, reconstructs, and compares with the truth; bounds are computed at the truth from noise-free points.
 
 use crate::offline::conic::sampson::Cloud;
+use crate::offline::decide::reconstruct::reconstruct;
 use crate::offline::rim::circle::frame_of;
-use crate::offline::rim::cone::{camera_centre, project};
 use crate::offline::rim::ml::TwoViews;
-use crate::offline::rim::model::{EdgePoint, Options, Projection, Reconstruction, Rim, RimChoice, RimModel, Scatter};
-use crate::offline::rim::reconstruct::reconstruct;
+use crate::offline::rim::model::{Options, Reconstruction, Rim, RimChoice, RimModel};
 use crate::offline::rim::synthetic::{Random, rig, rim_of, rim_point};
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::{camera_centre, project};
+use crate::offline::types::{EdgePoint, Scatter};
 use nalgebra::{SMatrix, SVector, Vector2, Vector3};
 use std::f64::consts::TAU;
 use std::fmt::Write as _;

@@ -1,10 +1,12 @@
-//! Wrong and absurd selections: none gives a wrong answer that passes more often than 1 in 1,000, none panics; and right ones pass.
+//! Wrong and absurd selections: fewer than 1 in 1,000 give a wrong answer, none panics, and correct ones are answered.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
-use graspd_calib::offline::rim::cone::project;
-use graspd_calib::offline::rim::model::{EdgePoint, Options, Projection, Rim, RimChoice};
-use graspd_calib::offline::rim::reconstruct::reconstruct;
+use graspd_calib::offline::decide::reconstruct::reconstruct;
+use graspd_calib::offline::rim::model::{Options, Rim, RimChoice};
 use graspd_calib::offline::rim::synthetic::{Random, rig, rim_point, rim_tilted};
+use graspd_calib::offline::types::EdgePoint;
+use graspd_calib::offline::types::projection::Projection;
+use graspd_calib::offline::types::projection::project;
 use nalgebra::Vector3;
 use std::f64::consts::TAU;
 
@@ -27,21 +29,21 @@ fn seen(p: &Projection, rim: &Rim, n: usize, part: f64, r: &mut Random) -> Vec<E
         .collect()
 }
 
-/// Whether an answer is right to within the task's needs: five of its own standard deviations.
+/// Whether an answer is right to within five of its own standard deviations.
 fn right(rim: &Rim, got: &graspd_calib::offline::rim::model::Reconstruction) -> bool {
     (got.rim.centre - rim.centre).norm() < 5.0 * got.report.sigma_centre
         && got.rim.normal.cross(&rim.normal).norm() < 5.0 * got.report.sigma_normal
 }
 
 #[test]
-fn a_thousand_well_posed_scenes_are_all_answered_and_right() {
+fn well_posed_scenes_are_answered_correctly() {
     let p = rig(0.5, 1200.0, 1.5);
     let mut r = Random::new(11);
     let mut wrong = 0;
     for i in 0..1000 {
         let rim = random_rim(&mut r);
         let both_see = p.iter().all(|q| {
-            let o = graspd_calib::offline::rim::cone::camera_centre(q).unwrap();
+            let o = graspd_calib::offline::types::projection::camera_centre(q).unwrap();
             (o - rim.centre).normalize().dot(&rim.normal) > 0.17
         });
         if !both_see {
@@ -52,12 +54,13 @@ fn a_thousand_well_posed_scenes_are_all_answered_and_right() {
         let got = reconstruct(&l, &p[0], &q, &p[1], &options).unwrap_or_else(|e| panic!("scene {i}: {e}"));
         wrong += usize::from(!right(&rim, &got));
     }
-    // The information criterion calls a faint ellipse a circle now and then: that is the price of the model, not an error of the fit.
+    // The information criterion sometimes chooses a circle for a faint ellipse: the price of the model choice, not an
+    // error of the fit.
     assert!(wrong <= 10, "{wrong}");
 }
 
 #[test]
-fn a_round_rim_between_the_cameras_is_no_ellipse_before_them() {
+fn a_circle_seen_from_opposite_faces_is_not_answered_as_an_ellipse() {
     let mut r = Random::new(14);
     let (mut asked, mut answered) = (0, 0);
     while asked < 300 {
@@ -65,8 +68,9 @@ fn a_round_rim_between_the_cameras_is_no_ellipse_before_them() {
         let p = rig(r.uniform(1.0, 2.4), 1200.0, 1.5);
         let x = Vector3::new(r.uniform(-0.05, 0.05), r.uniform(-0.05, 0.05), r.uniform(1.3, 1.7));
         let rim = rim_tilted(x, r.uniform(1.2, 1.57), r.uniform(-0.4, 0.4), 0.075, 0.075);
-        let side =
-            p.map(|q| (graspd_calib::offline::rim::cone::camera_centre(&q).unwrap() - x).normalize().dot(&rim.normal));
+        let side = p.map(|q| {
+            (graspd_calib::offline::types::projection::camera_centre(&q).unwrap() - x).normalize().dot(&rim.normal)
+        });
         if !(side[0] * side[1] < 0.0 && side.iter().all(|s| s.abs() > 0.15)) {
             continue;
         }
@@ -100,7 +104,7 @@ fn absurd_selections_pass_less_than_once_in_a_thousand() {
             // Random clicks in both views, or in one.
             0 => (noise(n), noise(n)),
             1 => (noise(n), seen(&p[1], &a, 80, 1.0, &mut r)),
-            // Two different objects, whole or in part.
+            // Two different objects, entire or in part.
             2 => (seen(&p[0], &a, 80, 1.0, &mut r), seen(&p[1], &b, 80, 1.0, &mut r)),
             3 => (seen(&p[0], &a, 80, 0.5, &mut r), seen(&p[1], &b, 80, 0.5, &mut r)),
             // A concentric contour of another size.
@@ -146,15 +150,16 @@ fn absurd_selections_pass_less_than_once_in_a_thousand() {
         }
     }
     println!("{passed} of {total} passed, by kind {kinds:?}");
-    // Swapped views of a rim near the middle of a symmetrical rig are images of another, equally possible rim: no test of the points
-    // can see it, and refusing both orders would refuse the right one as well. Measured: 34 of 1,250;
-    // the epipolar geometry predicts it for rims within a few pixels of the middle. They are counted by themselves.
+    // Swapped views of a rim near the middle of a symmetrical rig are images of another, equally possible rim. No test
+    // of the points can detect that, and refusing both orders would refuse the right one as well. Measured: 34 of
+    // 1,250; the epipolar geometry predicts it for rims within a few pixels of the middle. They are counted
+    // separately.
     assert!(kinds[5] * 8 * 20 <= total, "swapped: {} of {}", kinds[5], total / 8);
     assert!(passed * 1000 <= total, "{passed} of {total}: {kinds:?}");
 }
 
 #[test]
-fn no_input_whatever_panics() {
+fn no_input_panics() {
     let p = rig(0.5, 1200.0, 1.5);
     let mut r = Random::new(13);
     let odd = [0.0, -0.0, 1.0, f64::NAN, f64::INFINITY, -f64::INFINITY, 1e308, -1e308, 1e-308, 5e-324, 1e150, 640.0];

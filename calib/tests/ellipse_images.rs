@@ -1,4 +1,4 @@
-//! Plane ellipses and circles of paint in rendered images: found by one click a view, right, and not mistaken for bars.
+//! Painted ellipses and circles in rendered images: found by one click per view, accurate, and not mistaken for bars.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::{GripperFile, RigFile};
@@ -72,7 +72,7 @@ fn image(rig: &RigFile, view: View, rim: &Rim, r: &mut Random) -> GreyImage {
 
 fn planned(rig: &RigFile, gripper: &GripperFile, rim: &Rim, r: &mut Random) -> Result<Plan, PlanError> {
     let images = View::BOTH.map(|v| image(rig, v, rim, r));
-    // On the rim, where the two views agree roughly, and a pixel beside it as a hand is.
+    // On the rim, at nearly the same point in both views, with the error of a hand.
     let point = rim.centre + rim.axis_b * rim.b;
     let click = View::BOTH.map(|v| {
         let p = rig.rig.project(v, &point).unwrap();
@@ -82,7 +82,7 @@ fn planned(rig: &RigFile, gripper: &GripperFile, rim: &Rim, r: &mut Random) -> R
 }
 
 #[test]
-fn plane_ellipses_of_every_shape_are_found_and_right() {
+fn plane_ellipses_of_every_axis_ratio_are_found_accurately() {
     let rig = RigFile::parse(RIG, "rig.toml").unwrap();
     let here = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut gripper = GripperFile::load(&here.join("../examples/motorcycle/gripper.toml")).unwrap();

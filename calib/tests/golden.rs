@@ -1,4 +1,4 @@
-//! The golden cases: every field of every case within the tolerances that the file states, whatever the names and the order.
+//! The golden cases: every field of every case within the tolerances stated in the file.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use serde_json::Value;
@@ -171,8 +171,9 @@ fn every_golden_case_is_within_its_tolerances() {
     println!("closest to its tolerance: {} at {:.3} of it", w.1, w.0);
 }
 
-/// Random rigs (verged, parallel, skew, rolled, portrait, any frame, unit and scale of P), rims and noise, with what the numpy reference
-/// answers; made beside it, so that the golden file is not all that the chain was ever held against.
+/// Random rigs (verged, parallel, skew, rolled, portrait, any frame, unit and scale of P), rims and noise, with what
+/// the numpy reference answers; made independently, so that the golden file is not all that the chain was ever held
+/// against.
 #[test]
 fn random_rigs_agree_with_the_reference() {
     const RANDOM: &str = include_str!("data/conic_random.json");

@@ -1,15 +1,17 @@
-//! The choice of the grasp on a rim: the free angle, the four positions, what hides marks, the turn and the path from the present pose.
+//! The choice of the grasp on a rim: the free angle, the four positions, hidden marks, the rotation and the path from
+//! the present pose.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::GripperFile;
+use graspd_calib::offline::decide::reconstruct::reconstruct;
 use graspd_calib::offline::edges::lens::projection;
 use graspd_calib::offline::handle::grasp::{Approach, GraspError, LEAST_MARKS, choose};
 use graspd_calib::offline::handle::setpoint::{RimObstacle, Scene, fewest_on_the_way};
 use graspd_calib::offline::handle::{FLAT, direction, gripper_pose};
-use graspd_calib::offline::rim::cone::project;
-use graspd_calib::offline::rim::model::{EdgePoint, Options, Reconstruction, RimChoice};
-use graspd_calib::offline::rim::reconstruct::reconstruct;
+use graspd_calib::offline::rim::model::{Options, Reconstruction, RimChoice};
 use graspd_calib::offline::rim::synthetic::{rim_point, rim_tilted};
+use graspd_calib::offline::types::EdgePoint;
+use graspd_calib::offline::types::projection::project;
 use graspd_rt::geom::{Camera, Pose, Rig, Vec3, View};
 use nalgebra::UnitQuaternion;
 use std::f64::consts::{PI, TAU};
@@ -73,7 +75,7 @@ fn at(scene: &Scene<'_>, r: &Reconstruction, a: &Approach, phi: f64) -> ([usize;
 }
 
 #[test]
-fn the_free_angle_is_the_best_of_the_whole_turn_for_the_better_view() {
+fn the_free_angle_is_the_best_of_the_full_turn_for_the_better_view() {
     let g = gripper(0.7, "[[body]]\ncentre_m = [0.0, 0.0, -0.1]\nhalf_size_m = [0.06, 0.02, 0.01]\n");
     for k in 0..8 {
         let r = rim(0.3 + 0.05 * f64::from(k), f64::from(k) * 0.8, 0.07, 0.07);
@@ -106,7 +108,7 @@ fn the_free_angle_is_the_best_of_the_whole_turn_for_the_better_view() {
 }
 
 #[test]
-fn marks_that_look_alike_at_every_angle_leave_the_smallest_turn() {
+fn a_flat_criterion_gives_the_smallest_turn() {
     let g = gripper(0.0, "");
     let r = rim(0.35, 0.9, 0.07, 0.07);
     let free = choose(&rig(), &g, &r, &Approach::default()).unwrap();
@@ -197,7 +199,7 @@ fn the_gripper_and_the_object_hide_marks() {
 }
 
 #[test]
-fn the_path_tells_where_it_loses_marks() {
+fn the_path_reports_where_marks_are_lost() {
     let r = rim(0.3, 0.4, 0.07, 0.07);
     let (rig, g) = (rig(), gripper(0.0, ""));
     let scene = Scene::new(&rig, &g, 0.15, None);
@@ -205,7 +207,7 @@ fn the_path_tells_where_it_loses_marks() {
     let pregrasp = gripper_pose(&r.rim, &direction(&r.rim, 0.3), 0.12);
     let near = pregrasp * Pose::translation(0.02, 0.01, -0.1);
     assert_eq!(fewest_on_the_way(&scene, &[near, pregrasp, grasp], 20).map(|f| f.0), [5, 5]);
-    // Turned away at the start: nothing is seen there, and it says where.
+    // Turned away at the start: no mark is visible there, and the fraction says where.
     let away = near * Pose::rotation(Vec3::x() * 2.2);
     for (n, fraction) in fewest_on_the_way(&scene, &[away, pregrasp, grasp], 20) {
         assert!(n < LEAST_MARKS && fraction < 0.1, "{n} {fraction}");

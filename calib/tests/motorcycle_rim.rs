@@ -1,4 +1,5 @@
-//! One click a view on the rims of the real motorcycle pair, against the ground truth and the reference's own figures.
+//! One click per view on the rims of the real motorcycle pair, against the ground truth and the figures of the
+//! reference.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::{GripperFile, RigFile};
@@ -62,13 +63,13 @@ fn far(c: &Vec3, n: &Vec3, truth: &serde_json::Value) -> (f64, f64) {
 }
 
 impl Example {
-    /// What clicks at these places lead to.
+    /// Plans for clicks at these positions.
     fn clicked(&self, rim: &serde_json::Value, choice: RimChoice, step: usize) -> Vec<Plan> {
         let (l, r) = (rim["clicks_left"].as_array().unwrap(), rim["clicks_right"].as_array().unwrap());
         let mut options = PlanOptions::default();
         options.rim.rim = choice;
         if choice == RimChoice::Ellipse {
-            // Two thirds of a rim that is nearly round leave an ellipse's normal to 2.7 degrees.
+            // Two thirds of a nearly round rim determine the normal of an ellipse to 2.7 degrees.
             options.rim.max_sigma_normal = 3f64.to_radians();
         }
         let one = |(a, b)| {
@@ -86,14 +87,14 @@ impl Example {
     }
 }
 
-/// Whatever place of the rim was clicked, it is the same rim.
+/// Clicks at every position of the rim give the same rim.
 fn assert_same(plans: &[Plan], within: f64) {
     let first = plans[0].reconstruction.rim.centre;
     assert!(plans.iter().all(|p| (p.reconstruction.rim.centre - first).norm() < within));
 }
 
 #[test]
-fn one_click_a_view_finds_the_front_rim_as_well_as_the_reference_does() {
+fn one_click_per_view_finds_the_front_rim_as_accurately_as_the_reference() {
     let e = load();
     let truth = &e.front["reference"]["ground_truth"];
     for k in ["edges_paper", "edges_polar", "edges_ml_ellipse", "edges_ml_circle"] {
@@ -102,12 +103,12 @@ fn one_click_a_view_finds_the_front_rim_as_well_as_the_reference_does() {
         eprintln!("{k:<18} centre {c:.2} mm, normal {n:.2} degrees, axis ratio {:.4}", ratio(r));
     }
     eprintln!("ground truth{:>57.4}", ratio(truth));
-    // A wheel is round, and its edges do not say otherwise by more than they are off together: left open it is taken for a circle, as the
-    // reference's circle is a degree off, and admits it.
+    // A wheel is round, and its edges do not contradict that by more than their correlated error: with --rim auto it
+    // is a circle. Its normal is a degree off, like the reference's circle, and the covariance covers that.
     for p in e.clicked(&e.front, RimChoice::Auto, 5) {
         let (_, n) = far(&p.reconstruction.rim.centre, &p.reconstruction.rim.normal, truth);
         let sigma = p.reconstruction.report.sigma_normal.to_degrees();
-        eprintln!("left open: {} normal {n:.2} degrees (sigma {sigma:.2})", p.file.object.model);
+        eprintln!("--rim auto: {} normal {n:.2} degrees (sigma {sigma:.2})", p.file.object.model);
         assert!(n < 1.5 && n < 3.5 * sigma, "{n} degrees, sigma {sigma}");
     }
     let plans = e.clicked(&e.front, RimChoice::Ellipse, 5);
@@ -115,7 +116,7 @@ fn one_click_a_view_finds_the_front_rim_as_well_as_the_reference_does() {
     for p in plans {
         let rim = &p.reconstruction.rim;
         let (c, n) = far(&rim.centre, &rim.normal, truth);
-        eprintln!("one click a view   centre {c:.2} mm, normal {n:.2} degrees, axis ratio {:.4}", rim.b / rim.a);
+        eprintln!("one click per view centre {c:.2} mm, normal {n:.2} degrees, axis ratio {:.4}", rim.b / rim.a);
         assert!(c < 0.6 && n < 0.81, "{c} mm {n} degrees");
         assert!(
             (rim.b / rim.a - ratio(truth)).abs() < 0.018,
@@ -126,11 +127,12 @@ fn one_click_a_view_finds_the_front_rim_as_well_as_the_reference_does() {
 }
 
 #[test]
-fn one_click_a_view_finds_the_rear_rim_as_well_as_the_reference_does() {
+fn one_click_per_view_finds_the_rear_rim_as_accurately_as_the_reference() {
     let e = load();
     let reference = &e.rear["reference"];
     let truth = &reference["ground_truth"];
-    // The rim is as good as a circle to its edges, and an ellipse by a hundredth to the ground truth: said to be a circle it is a degree off, and admits it.
+    // The rim is a circle to within its edges, and an ellipse by one percent in the ground truth. As a circle its
+    // normal is a degree off, and the covariance covers that.
     for (choice, model, worst_deg) in [(RimChoice::Ellipse, "ellipse", 0.7), (RimChoice::Auto, "circle", 1.5)] {
         let plans = e.clicked(&e.rear, choice, 1);
         assert_same(&plans, 4e-3);
@@ -143,7 +145,8 @@ fn one_click_a_view_finds_the_rear_rim_as_well_as_the_reference_does() {
                 rim.b / rim.a
             );
             assert_eq!(p.file.object.model, model);
-            // What the images leave open of the rig is a few millimetres of depth at this distance, and has to be admitted.
+            // The images leave a few millimetres of depth undetermined at this distance, which the covariance has to
+            // cover.
             let sigma_mm = report.sigma_centre * 1e3;
             let most = reference["centre_mm"][0].as_f64().unwrap() + 2.5;
             assert!(c < most && n < worst_deg, "{c} mm of {most}, {n} degrees");

@@ -1,12 +1,14 @@
-//! Round-bar rims: a simulated torus wheel, its outlines in both views with noise.
+//! Round-bar rims: a simulated torus wheel with noisy outlines in both views.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::offline::bar::torus::{Torus, outline};
-use graspd_calib::offline::rim::cone::{camera_centre, project};
-use graspd_calib::offline::rim::model::{EdgePoint, Options, Projection, RimChoice, RimModel};
-use graspd_calib::offline::rim::reconstruct::reconstruct;
+use graspd_calib::offline::decide::reconstruct::reconstruct;
+use graspd_calib::offline::rim::model::{Options, RimChoice, RimModel};
 use graspd_calib::offline::rim::refusal::Refusal;
 use graspd_calib::offline::rim::synthetic::{Random, rig, rim_tilted};
+use graspd_calib::offline::types::EdgePoint;
+use graspd_calib::offline::types::projection::Projection;
+use graspd_calib::offline::types::projection::{camera_centre, project};
 use nalgebra::Vector3;
 use std::f64::consts::TAU;
 
@@ -27,9 +29,9 @@ fn wheel(random: &mut Random, core: f64, bar: f64, tilt_deg: f64, sigma: f64) ->
     let mut outer = [Vec::new(), Vec::new()];
     let mut inner = [Vec::new(), Vec::new()];
     for k in 0..2 {
-        let eye = camera_centre(&p[k]).unwrap();
+        let camera = camera_centre(&p[k]).unwrap();
         for i in 0..200 {
-            let [out, hole] = outline(&torus, &eye, TAU * f64::from(i) / 200.0).unwrap();
+            let [out, hole] = outline(&torus, &camera, TAU * f64::from(i) / 200.0).unwrap();
             let (a, b) = (project(&p[k], &out), project(&p[k], &hole));
             let mut n = || sigma * random.normal();
             outer[k].push(EdgePoint::new(a.x + n(), a.y + n(), SIGMA));
@@ -50,7 +52,7 @@ fn options(rim: RimChoice) -> Options {
 }
 
 #[test]
-fn both_outlines_give_the_wheel_at_the_level_of_a_plane_circle() {
+fn both_outlines_determine_the_wheel_as_well_as_a_plane_circle() {
     let mut random = Random::new(5);
     let mut worst = [0.0f64; 4];
     for (core, bar) in [(0.08, 0.01), (0.08, 0.006), (0.15, 0.015), (0.05, 0.008)] {
@@ -67,7 +69,8 @@ fn both_outlines_give_the_wheel_at_the_level_of_a_plane_circle() {
                     (r.rim.a - core).abs(),
                     (r.bar_radius.unwrap() - bar).abs(),
                 ];
-                // Four standard deviations of its own covariance, for every figure: the covariance has to be honest.
+                // Within four standard deviations of its own covariance for every quantity: the covariance has to be
+                // consistent.
                 assert!(errors[0] < 4.0 * r.report.sigma_centre && errors[1] < 4.0 * r.report.sigma_normal);
                 assert!(errors[2] < 4.5 * r.cov_axes[(0, 0)].sqrt() && errors[3] < 4.5 * r.cov_axes[(1, 1)].sqrt());
                 assert!((0.85..1.15).contains(&r.report.noise), "{}", r.report.noise);
@@ -99,7 +102,7 @@ fn a_wheel_taken_for_a_plane_edge_is_refused_or_wrong_by_degrees() {
 }
 
 #[test]
-fn one_outline_alone_is_refused_by_its_covariance_and_a_known_diameter_mends_it() {
+fn one_outline_alone_is_refused_unless_the_diameter_is_known() {
     let mut random = Random::new(7);
     let mut refused = 0;
     for tilt in [15.0, 35.0, 60.0] {
@@ -109,7 +112,7 @@ fn one_outline_alone_is_refused_by_its_covariance_and_a_known_diameter_mends_it(
                 assert!(matches!(e, Refusal::BarUndetermined { .. }), "{e}");
                 refused += 1;
             }
-            // At some attitudes one outline happens to be enough; then the covariance has to be small and true.
+            // At some orientations one outline is enough; then the covariance has to be small and consistent.
             Ok(r) => {
                 let tip = r.rim.normal.cross(&w.torus.normal).norm();
                 assert!(tip < 4.0 * r.report.sigma_normal && r.report.sigma_normal.to_degrees() < 0.3, "{tilt}");
@@ -125,11 +128,11 @@ fn one_outline_alone_is_refused_by_its_covariance_and_a_known_diameter_mends_it(
 }
 
 #[test]
-fn spokes_hidden_stretches_and_wrong_pairs() {
+fn outliers_and_occlusions_are_tolerated_and_wrong_pairs_refused() {
     let mut random = Random::new(8);
     let w = wheel(&mut random, 0.1, 0.01, 30.0, SIGMA);
     let mut points = w.both();
-    // A third of each outline is hidden, and one point in eight lies on something else.
+    // A third of each outline is hidden, and one point in eight is an outlier.
     for list in &mut points {
         let mut i = 0;
         list.retain(|_| {

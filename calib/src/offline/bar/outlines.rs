@@ -1,28 +1,28 @@
-//! Where a bar's outlines are in an image, and which edges there are likely to be theirs.
+//! Predicted outlines of a bar in an image, and the edges that are likely to belong to them.
 
 use crate::offline::bar::torus::{Torus, outline};
-use crate::offline::conic::robust::median;
-use crate::offline::contour::follow::{Place, places};
+use crate::offline::contour::follow::{CurvePoint, curve_points};
 use crate::offline::contour::{Contour, ContourPoint, ViewEdges};
 use crate::offline::rim::circle::frame_of;
-use crate::offline::rim::cone::project;
-use crate::offline::rim::model::Projection;
+use crate::offline::statistics::median;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::project;
 use graspd_rt::geom::Pixel;
 use nalgebra::Vector3;
 
-/// Strength of an edge that is half believed, in parts of the median along the clicked outline.
-const HALF_BELIEVED: f64 = 0.3;
-/// Least cosine between an edge's gradient and the normal of an outline that it may belong to.
-const ALIGNED: f64 = 0.93;
-/// Places at which a guess is tested.
-const TESTED: usize = 72;
+/// Strength of an edge with weight one half, as a fraction of the median along the clicked outline.
+const HALF_WEIGHT_STRENGTH: f64 = 0.3;
+/// Smallest cosine between an edge's gradient and the normal of an outline that it may belong to.
+const MIN_COSINE: f64 = 0.93;
+/// Points at which a hypothesis is tested.
+const TEST_POINTS: usize = 72;
 
 /// One view of the search.
 pub(in crate::offline::bar) struct View<'a, 'b> {
     pub(in crate::offline::bar) edges: &'a ViewEdges<'b>,
     pub(in crate::offline::bar) p: &'a Projection,
-    eye: Vector3<f64>,
-    /// Strength of an edge that is half believed to be an outline, grey levels per pixel.
+    viewpoint: Vector3<f64>,
+    /// Strength of an edge with weight one half, grey levels per pixel.
     half: f64,
 }
 
@@ -31,30 +31,34 @@ impl<'a, 'b> View<'a, 'b> {
         edges: &'a ViewEdges<'b>,
         clicked: &Contour,
         p: &'a Projection,
-        eye: Vector3<f64>,
+        viewpoint: Vector3<f64>,
     ) -> Self {
         let strength = |c: &ContourPoint| edges.map.near(c.raw, 1).map(|(_, e)| e.strength).fold(0.0, f64::max);
-        let half = HALF_BELIEVED * median(clicked.points.iter().map(strength).collect());
-        Self { edges, p, eye, half: if half.is_finite() { half.max(1.0) } else { 1.0 } }
+        let half = HALF_WEIGHT_STRENGTH * median(clicked.points.iter().map(strength).collect());
+        Self { edges, p, viewpoint, half: if half.is_finite() { half.max(1.0) } else { 1.0 } }
     }
 
-    /// Length of a pixel at a place in space, across the line of sight.
+    /// Length of one pixel at a point in space, across the line of sight.
     pub(in crate::offline::bar) fn pixel_at(&self, x: &Vector3<f64>) -> f64 {
-        let depth = (x - self.eye).norm();
-        let across = frame_of(&(x - self.eye));
+        let depth = (x - self.viewpoint).norm();
+        let across = frame_of(&(x - self.viewpoint));
         let step = 1e-3 * depth;
         let here = project(self.p, x);
         let px = (0..2).map(|k| (project(self.p, &(x + across.column(k) * step)) - here).norm()).fold(0.0, f64::max);
         step / px
     }
 
-    /// The likeliest edge of an outline at each place in the image, and how likely the whole is, from 0 to 1.
+    /// The most likely edge at each point of a predicted outline, and the mean weight along it, from 0 to 1.
     ///
-    /// An outline is the sharpest step there is; a bar's shading makes softer ones of its own beside it, all the way round. So the strong edge wins, not the
-    /// nearest.
-    pub(in crate::offline::bar) fn outline_edges(&self, places: &[Place], tolerance: f64) -> (f64, Vec<Option<u32>>) {
-        let (mut sum, mut seen, mut hits) = (0.0, 0usize, Vec::with_capacity(places.len()));
-        for p in places {
+    /// An outline is the strongest step there is. The shading of a bar makes weaker ones beside it all the way around.
+    /// So the strong edge wins, not the nearest.
+    pub(in crate::offline::bar) fn outline_edges(
+        &self,
+        points: &[CurvePoint],
+        tolerance: f64,
+    ) -> (f64, Vec<Option<u32>>) {
+        let (mut sum, mut seen, mut hits) = (0.0, 0usize, Vec::with_capacity(points.len()));
+        for p in points {
             let raw = self.edges.lens.raw(p.at);
             if !self.edges.image.contains(raw, 6.0) {
                 continue;
@@ -65,12 +69,12 @@ impl<'a, 'b> View<'a, 'b> {
                 let Some(i) = self.edges.arcs.ideal.get(k) else { return };
                 let d = i.at - p.at;
                 let off = d.dot(&p.normal).abs() / tolerance;
-                if i.towards_bright.dot(&p.normal).abs() <= ALIGNED || off > 1.0 || d.norm() > tolerance + 1.5 {
+                if i.towards_bright.dot(&p.normal).abs() <= MIN_COSINE || off > 1.0 || d.norm() > tolerance + 1.5 {
                     return;
                 }
-                let worth = e.strength / (e.strength + self.half) * (1.0 - 0.5 * off * off);
-                if worth > best.0 {
-                    best = (worth, Some(k as u32));
+                let weight = e.strength / (e.strength + self.half) * (1.0 - 0.5 * off * off);
+                if weight > best.0 {
+                    best = (weight, Some(k as u32));
                 }
             });
             sum += best.0;
@@ -79,57 +83,57 @@ impl<'a, 'b> View<'a, 'b> {
         (sum / seen.max(1) as f64, hits)
     }
 
-    /// Places along the outer and the inner outline where they are not hidden by the bar itself.
-    pub(in crate::offline::bar) fn outlines(&self, torus: &Torus, corners: usize, step: f64) -> [Vec<Place>; 2] {
-        let bar = Bar::new(torus, &self.eye);
-        [0, 1].map(|k| self.places(&bar, k, corners, step))
+    /// Points along the outer and the inner outline where the bar itself does not hide them.
+    pub(in crate::offline::bar) fn outlines(&self, torus: &Torus, corners: usize, step: f64) -> [Vec<CurvePoint>; 2] {
+        let bar = Bar::new(torus, &self.viewpoint);
+        [0, 1].map(|k| self.points(&bar, k, corners, step))
     }
 
-    /// The same along one of them: 0 is the outer one.
-    fn places(&self, bar: &Bar<'_>, which: usize, corners: usize, step: f64) -> Vec<Place> {
+    /// Points along one outline: 0 is the outer one.
+    fn points(&self, bar: &Bar<'_>, which: usize, corners: usize, step: f64) -> Vec<CurvePoint> {
         let corner = |k: usize| {
             let angle = std::f64::consts::TAU * k as f64 / corners as f64;
-            let x = *outline(bar.torus, bar.eye, angle)?.get(which)?;
+            let x = *outline(bar.torus, bar.viewpoint, angle)?.get(which)?;
             let u = project(self.p, &x);
             (!bar.hides(&x, angle) && u.iter().all(|v| v.is_finite())).then_some(u)
         };
         let curve: Vec<Option<Pixel>> = (0..corners).map(corner).collect();
-        places(&curve, step, project(self.p, &bar.torus.centre))
+        curve_points(&curve, step, project(self.p, &bar.torus.centre))
     }
 }
 
-/// Points of the core at which a bar may stand before its own outline.
+/// Points of the core circle that are tested for occlusion.
 const AROUND: usize = 48;
 
-/// A bar seen from a place.
+/// A bar seen from a projection centre.
 struct Bar<'a> {
     torus: &'a Torus,
-    eye: &'a Vector3<f64>,
-    /// Points of the core from the eye, with their squared distance.
+    viewpoint: &'a Vector3<f64>,
+    /// Points of the core circle relative to the projection centre, with their squared distance.
     core: [(Vector3<f64>, f64); AROUND],
 }
 
 impl<'a> Bar<'a> {
-    fn new(torus: &'a Torus, eye: &'a Vector3<f64>) -> Self {
+    fn new(torus: &'a Torus, viewpoint: &'a Vector3<f64>) -> Self {
         let f = frame_of(&torus.normal);
         let core = std::array::from_fn(|k| {
             let (sin, cos) = Self::angle(k).sin_cos();
-            let c = torus.centre + (f.column(0) * cos + f.column(1) * sin) * torus.core - eye;
+            let c = torus.centre + (f.column(0) * cos + f.column(1) * sin) * torus.core - viewpoint;
             (c, c.norm_squared())
         });
-        Self { torus, eye, core }
+        Self { torus, viewpoint, core }
     }
 
     fn angle(k: usize) -> f64 {
         std::f64::consts::TAU * k as f64 / AROUND as f64
     }
 
-    /// Whether another part of the bar stands before a point of its outline at a core angle.
+    /// Whether another part of the bar hides a point of its outline at a core angle.
     fn hides(&self, x: &Vector3<f64>, angle: f64) -> bool {
-        let sight = x - self.eye;
+        let sight = x - self.viewpoint;
         let reach = sight.norm();
         let d = sight / reach;
-        // The chord between two of the core's points strays from it by a little.
+        // The chord between two core points deviates slightly from the circle.
         let near = (0.97 * self.torus.bar).powi(2);
         let own = 3.0 * self.torus.bar / self.torus.core;
         self.core.iter().enumerate().any(|(k, (c, square))| {
@@ -142,7 +146,8 @@ impl<'a> Bar<'a> {
     }
 }
 
-/// How much of the other outline carries edges, the worse view counting most: whatever edges, and by how likely they are an outline.
+/// Fraction of the other outline that carries edges, with the worse view weighted most: any edges, and edges by their
+/// weight.
 pub(in crate::offline::bar) fn support(
     views: &[View<'_, '_>; 2],
     t: &Torus,
@@ -151,7 +156,7 @@ pub(in crate::offline::bar) fn support(
 ) -> (f64, f64) {
     let (mut least, mut sum) = ([f64::INFINITY; 2], [0.0; 2]);
     for v in views {
-        let other = v.places(&Bar::new(t, &v.eye), usize::from(clicked_outer), TESTED, 0.0);
+        let other = v.points(&Bar::new(t, &v.viewpoint), usize::from(clicked_outer), TEST_POINTS, 0.0);
         let (likely, hits) = v.outline_edges(&other, tolerance);
         let any = hits.iter().flatten().count() as f64 / hits.len().max(1) as f64;
         for (k, c) in [any, likely].into_iter().enumerate() {

@@ -1,49 +1,56 @@
-//! From a guess to a bar: its outlines are followed and the bar is fitted to them until it stands still.
+//! From a hypothesis to a bar: its outlines are followed and the bar is fitted to them until it converges.
 
 use crate::offline::bar::found::BarFound;
-use crate::offline::bar::limb::{Limb, THINNEST_PX};
+use crate::offline::bar::limb::{Limb, MIN_RADIUS_PX};
 use crate::offline::bar::outlines::{View, support};
+use crate::offline::bar::result::reconstruct_bar;
 use crate::offline::bar::torus::{Free, Ray, Torus, fit, rays};
-use crate::offline::conic::robust::median;
 use crate::offline::contour::Contour;
-use crate::offline::contour::follow::{Finish, STEP_PX};
+use crate::offline::contour::follow::{RefineEdge, STEP_PX};
 use crate::offline::edges::Refined;
-use crate::offline::edges::sharpen::sharpen;
-use crate::offline::rim::model::{EdgePoint, Options, Outline, RimChoice};
-use crate::offline::rim::reconstruct::reconstruct;
+use crate::offline::edges::separate::separate;
+use crate::offline::rim::model::Options;
+use crate::offline::statistics::median;
+use crate::offline::types::{EdgePoint, Outline};
 use graspd_rt::geom::Pixel;
 
-/// A bar thinner than this part of its ring's radius is one outline taken for two.
-const THINNEST: f64 = 0.015;
-/// Rounds in which a guess may move before its outlines are followed, and the window of each, pixels.
-const ROUNDS: [f64; 6] = [3.0, 3.0, 2.5, 2.0, 1.5, 1.5];
-/// How often, and in steps of how many pixels, a thicker bar is looked for around one that was found.
-const OUTWARD: usize = 2;
-const OUTWARD_STEP: f64 = 0.75;
-const OUTWARD_STEPS: i32 = 8;
-/// Part of the found outline's edges that a thicker bar's has to have.
-const AS_GOOD: f64 = 0.7;
-/// What a limb's place is worth where its falling off is not seen undisturbed, pixels.
-const SPOILT_PX: f64 = 0.25;
-/// Noise about a bar (in the edges' own) of edges as they were detected, above which it is not worth another look: limbs beside paint reach seven.
-const HOPELESS: f64 = 8.0;
-/// Corners of a predicted outline.
+/// Smallest bar radius as a fraction of the core radius: a thinner bar is one outline matched twice.
+const MIN_BAR_FRACTION: f64 = 0.015;
+/// Largest bar radius as a fraction of the core radius.
+const MAX_BAR_FRACTION: f64 = 0.6;
+/// Windows around the outlines in successive rounds of the approach, pixels.
+const WINDOWS_PX: [f64; 6] = [3.0, 3.0, 2.5, 2.0, 1.5, 1.5];
+/// Number of searches for a thicker bar around one that was found.
+const THICKER_ROUNDS: usize = 2;
+/// Step of that search, pixels.
+const THICKER_STEP_PX: f64 = 0.75;
+/// Steps of that search.
+const THICKER_STEPS: i32 = 8;
+/// Smallest likelihood of a thicker bar's outline, as a fraction of the found one's.
+const MIN_THICKER_LIKELIHOOD: f64 = 0.7;
+/// Standard deviation added to a limb whose fall-off is disturbed by something beside it, pixels.
+const DISTURBED_LIMB_SIGMA_PX: f64 = 0.25;
+/// Largest noise of detected edges about a bar that is refined further, in the edges' own standard deviations: limbs
+/// beside paint reach seven.
+const MAX_DETECTED_NOISE: f64 = 8.0;
+/// Corners of a predicted outline's polygon.
 const CORNERS: usize = 720;
 
-/// Follows all four outlines of a guess and fits the bar to them until it stands still. `support` is what speaks for the guess.
+/// Follows all four outlines of a hypothesis and fits the bar to them until it converges. `support` is the support of
+/// the hypothesis.
 pub(in crate::offline::bar) fn settle(
     views: &[View<'_, '_>; 2],
-    guess: Torus,
+    hypothesis: Torus,
     support: f64,
     options: &Options,
 ) -> Option<BarFound> {
     let free = if options.bar_diameter.is_some() { Free::KnownBar } else { Free::All };
-    let mut torus = approach(views, guess, free, &ROUNDS)?;
-    // A bar of known thickness cannot be thicker.
-    let outwards = if free == Free::All { OUTWARD } else { 0 };
+    let mut torus = approach(views, hypothesis, free, &WINDOWS_PX)?;
+    // A bar of known diameter cannot be thicker.
+    let outwards = if free == Free::All { THICKER_ROUNDS } else { 0 };
     for _ in 0..outwards {
-        let Some(thicker) = outward(views, &torus).and_then(|t| approach(views, t, free, &ROUNDS)) else { break };
-        // It may lead back to where it came from.
+        let Some(thicker) = outward(views, &torus).and_then(|t| approach(views, t, free, &WINDOWS_PX)) else { break };
+        // The fit may return to the bar it started from.
         let grown = thicker.bar - torus.bar;
         if !(grown > 0.02 * torus.bar) {
             break;
@@ -53,15 +60,15 @@ pub(in crate::offline::bar) fn settle(
     follow(views, torus, support, options)
 }
 
-/// Fits the bar to the likeliest edges beside its outlines, again and again in narrowing windows.
+/// Fits the bar to the most likely edges beside its outlines, repeatedly, in narrowing windows.
 fn approach(views: &[View<'_, '_>; 2], start: Torus, free: Free, windows: &[f64]) -> Option<Torus> {
     let mut torus = start;
     for tolerance in windows {
         let mut all: Vec<Ray> = Vec::new();
         for v in views {
-            for places in v.outlines(&torus, CORNERS / 2, STEP_PX) {
-                let (_, hits) = v.outline_edges(&places, *tolerance);
-                // Every other edge is enough to come near.
+            for points in v.outlines(&torus, CORNERS / 2, STEP_PX) {
+                let (_, hits) = v.outline_edges(&points, *tolerance);
+                // Every other edge is enough for the approach.
                 let points: Vec<EdgePoint> = hits
                     .iter()
                     .flatten()
@@ -80,7 +87,7 @@ fn approach(views: &[View<'_, '_>; 2], start: Torus, free: Free, windows: &[f64]
             let gate = (4.0 * 1.48 * median(r.clone())).max(0.25);
             keep = r.iter().map(|d| *d <= gate).collect();
         }
-        if !(torus.bar > THINNEST * torus.core && torus.bar < 0.6 * torus.core) {
+        if !(torus.bar > MIN_BAR_FRACTION * torus.core && torus.bar < MAX_BAR_FRACTION * torus.core) {
             return None;
         }
         let still = 1e-4 * torus.core;
@@ -91,7 +98,7 @@ fn approach(views: &[View<'_, '_>; 2], start: Torus, free: Free, windows: &[f64]
     Some(torus)
 }
 
-/// A thicker bar whose outlines have edges too: shading makes soft edges all along a bar, but inside its outlines only.
+/// A thicker bar whose outlines also have edges: shading makes weak edges along a bar, but only inside its outlines.
 fn outward(views: &[View<'_, '_>; 2], torus: &Torus) -> Option<Torus> {
     let pixel = views.iter().map(|v| v.pixel_at(&torus.centre)).fold(f64::INFINITY, f64::min);
     if !pixel.is_finite() {
@@ -101,16 +108,19 @@ fn outward(views: &[View<'_, '_>; 2], torus: &Torus) -> Option<Torus> {
     for outer in [true, false] {
         let sign = if outer { 0.5 } else { -0.5 };
         let at = |steps: f64| {
-            let out = steps * OUTWARD_STEP * pixel;
+            let out = steps * THICKER_STEP_PX * pixel;
             Torus { core: torus.core + sign * out, bar: torus.bar + 0.5 * out, ..*torus }
         };
         let seen: Vec<(f64, f64)> =
-            (0..=OUTWARD_STEPS).map(|k| support(views, &at(f64::from(k)), !outer, 1.0)).collect();
+            (0..=THICKER_STEPS).map(|k| support(views, &at(f64::from(k)), !outer, 1.0)).collect();
         let here = seen.first()?.1;
-        // The farthest peak that is about as good.
+        // The farthest peak that is nearly as good.
         let peak = (2..seen.len() - 1).rev().find(|k| {
             let l = |k: usize| seen.get(k).map_or(0.0, |s| s.1);
-            l(*k) >= l(k - 1) && l(*k) > l(k + 1) && l(*k) >= AS_GOOD * here && seen.get(*k).is_some_and(|s| s.0 >= 0.5)
+            l(*k) >= l(k - 1)
+                && l(*k) > l(k + 1)
+                && l(*k) >= MIN_THICKER_LIKELIHOOD * here
+                && seen.get(*k).is_some_and(|s| s.0 >= 0.5)
         });
         if let Some(k) = peak {
             let t = at(k as f64);
@@ -118,32 +128,33 @@ fn outward(views: &[View<'_, '_>; 2], torus: &Torus) -> Option<Torus> {
             moved.bar += t.bar - torus.bar;
         }
     }
-    (moved.bar > torus.bar && moved.bar < 0.6 * moved.core).then_some(moved)
+    (moved.bar > torus.bar && moved.bar < MAX_BAR_FRACTION * moved.core).then_some(moved)
 }
 
-/// How the edges of a followed outline are brought to their place.
+/// How the edges of a followed outline are located.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Sharp {
-    /// As they were detected.
-    No,
-    /// As a bar's limb; what is none is left out.
+enum Location {
+    /// As detected.
+    Detected,
+    /// As the limb of a bar; other edges are left out.
     Limb,
-    /// As a bar's limb, and where something else beside it (paint, a spoke) disturbs its falling off, as an edge like others, known less well.
-    Spoilt,
+    /// As the limb of a bar. Where something beside it (paint, a spoke) disturbs its fall-off, as a step with a larger
+    /// standard deviation.
+    LimbOrStep,
 }
 
-/// Follows the four outlines of a bar, tells their edges from their neighbours, and fits the bar to them.
+/// Follows the four outlines of a bar, separates their edges from neighbours, and fits the bar to them.
 fn follow(views: &[View<'_, '_>; 2], start: Torus, support: f64, options: &Options) -> Option<BarFound> {
-    let (rough, torus) = followed(views, start, 1.5, Sharp::No, support, options)?;
-    if rough.reconstruction.report.noise > HOPELESS {
+    let (rough, torus) = followed(views, start, 1.5, Location::Detected, support, options)?;
+    if rough.reconstruction.report.noise > MAX_DETECTED_NOISE {
         return None;
     }
-    // A bar that is too thin for a limb has edges like others, and nothing to spoil.
-    let thin = views.iter().all(|v| torus.bar < THINNEST_PX * v.pixel_at(&torus.centre));
-    let ways: &[Sharp] = if thin { &[Sharp::Limb] } else { &[Sharp::Limb, Sharp::Spoilt] };
-    ways.iter().find_map(|sharp| {
-        let (bar, torus) = followed(views, torus, 1.0, *sharp, support, options)?;
-        (bar.is_sound() && torus.bar > THINNEST * torus.core).then_some(bar)
+    // The outlines of a bar too thin for a limb are located as steps, which nothing can disturb.
+    let thin = views.iter().all(|v| torus.bar < MIN_RADIUS_PX * v.pixel_at(&torus.centre));
+    let locations: &[Location] = if thin { &[Location::Limb] } else { &[Location::Limb, Location::LimbOrStep] };
+    locations.iter().find_map(|location| {
+        let (bar, torus) = followed(views, torus, 1.0, *location, support, options)?;
+        (bar.is_sound() && torus.bar > MIN_BAR_FRACTION * torus.core).then_some(bar)
     })
 }
 
@@ -152,7 +163,7 @@ fn followed(
     views: &[View<'_, '_>; 2],
     torus: Torus,
     tolerance: f64,
-    sharp: Sharp,
+    location: Location,
     support: f64,
     options: &Options,
 ) -> Option<(BarFound, Torus)> {
@@ -160,23 +171,23 @@ fn followed(
         let [outer, inner] = v.outlines(&torus, CORNERS, STEP_PX);
         let (noise, blur) = (v.edges.map.noise(), v.edges.blur());
         let limb = Limb::new(blur, torus.bar / v.pixel_at(&torus.centre));
-        // Away from the bar is out of the outer outline, and into the inner one.
-        let finish = |r: &Refined, out: Pixel| {
-            let plain = || sharpen(v.edges.image, r, noise, blur);
+        // Away from the bar is outward on the outer outline, and inward on the inner one.
+        let locate = |r: &Refined, out: Pixel| {
+            let plain = || separate(v.edges.image, r, noise, blur);
             match &limb {
-                Some(l) => l.place(v.edges.image, r, out, noise, blur).or_else(|| {
-                    let r = if sharp == Sharp::Spoilt { plain()? } else { return None };
-                    Some(Refined { sigma: r.sigma.hypot(SPOILT_PX), ..r })
+                Some(l) => l.locate(v.edges.image, r, out, noise, blur).or_else(|| {
+                    let r = if location == Location::LimbOrStep { plain()? } else { return None };
+                    Some(Refined { sigma: r.sigma.hypot(DISTURBED_LIMB_SIGMA_PX), ..r })
                 }),
                 None => plain(),
             }
         };
-        let inwards = |r: &Refined, out: Pixel| finish(r, -out);
-        let [away, into]: [&Finish<'_>; 2] = [&finish, &inwards];
-        let wanted = sharp != Sharp::No;
+        let inwards = |r: &Refined, out: Pixel| locate(r, -out);
+        let [away, into]: [&RefineEdge<'_>; 2] = [&locate, &inwards];
+        let refined = location != Location::Detected;
         Some([
-            v.edges.follow(&outer, tolerance, wanted.then_some(away))?,
-            v.edges.follow(&inner, tolerance, wanted.then_some(into))?,
+            v.edges.follow(&outer, tolerance, refined.then_some(away))?,
+            v.edges.follow(&inner, tolerance, refined.then_some(into))?,
         ])
     };
     let [lo, li] = outlines(&views[0])?;
@@ -187,8 +198,7 @@ fn followed(
         all
     };
     let (l, r) = (points(&lo, &li), points(&ro, &ri));
-    let bar = Options { rim: RimChoice::RoundBar, ..*options };
-    let found = reconstruct(&l, views[0].p, &r, views[1].p, &bar).ok()?;
+    let found = reconstruct_bar([&l, &r], [views[0].p, views[1].p], options).ok()?;
     let torus = Torus { centre: found.rim.centre, normal: found.rim.normal, core: found.rim.a, bar: found.bar_radius? };
     Some((BarFound { outer: [lo, ro], inner: [li, ri], reconstruction: found, support }, torus))
 }

@@ -1,11 +1,12 @@
-//! The outline of a round bar bent to a circle: an edge point's viewing ray touches the tube, so its distance to the core circle is the
-//! bar's radius, on the outer and on the inner outline alike.
+//! The outline of a round bar bent to a circle (a torus): the viewing ray of an edge point touches the tube, so that
+//! its distance from the core circle is the bar's radius, on the outer and on the inner outline alike.
 
 use crate::offline::conic::eigen;
 use crate::offline::conic::levenberg::{self, Linear, Problem};
 use crate::offline::rim::circle::frame_of;
-use crate::offline::rim::cone::camera_centre;
-use crate::offline::rim::model::{EdgePoint, Projection};
+use crate::offline::types::EdgePoint;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::camera_centre;
 use nalgebra::{SMatrix, SVector, Vector2, Vector3};
 use std::cell::RefCell;
 
@@ -27,7 +28,7 @@ pub struct Torus {
 pub(crate) struct Ray {
     origin: Vector3<f64>,
     direction: Vector3<f64>,
-    /// Change of the unit direction per pixel along u and v, up to a part along the ray.
+    /// Change of the unit direction per pixel along u and v, up to a component along the ray.
     per_pixel: [Vector3<f64>; 2],
     sigma: f64,
 }
@@ -56,11 +57,11 @@ pub(crate) fn rays(points: &[EdgePoint], p: &Projection) -> Option<Vec<Ray>> {
         .collect()
 }
 
-/// Where a ray comes closest to the core circle.
+/// Closest approach of a ray to the core circle.
 struct Closest {
     /// Direction of the core point from the centre.
     e: Vector3<f64>,
-    /// Unit vector from the core point to the ray's foot.
+    /// Unit vector from the core point to the ray's closest point.
     w: Vector3<f64>,
     distance: f64,
     /// Change of the distance per pixel.
@@ -69,7 +70,7 @@ struct Closest {
     gradient: Vector2<f64>,
 }
 
-/// Axes of a torus' plane.
+/// Axes of the torus's plane.
 #[derive(Clone, Copy)]
 struct Axes {
     e1: Vector3<f64>,
@@ -82,9 +83,10 @@ impl Torus {
         Axes { e1: f.column(0).into_owned(), e2: f.column(1).into_owned() }
     }
 
-    /// Closest approach by at most 12 guarded Newton steps from the angle at which the ray pierces the plane.
+    /// Closest approach by at most 12 guarded Newton steps, from the angle at which the ray pierces the plane.
     ///
-    /// The angle is never needed, only its sine and cosine, which a step turns; and of the vectors only their parts along the plane's axes.
+    /// Only the sine and cosine of the angle are needed, which a step rotates, and only the components of the vectors
+    /// along the plane's axes.
     fn closest(&self, ray: &Ray, axes: &Axes) -> Option<Closest> {
         let core = self.core;
         let down = ray.direction.dot(&self.normal);
@@ -99,7 +101,8 @@ impl Torus {
         let across = perpendicular(&to);
         let (q1, q2) = (across.dot(&axes.e1), across.dot(&axes.e2));
         for _ in 0..12 {
-            // The ray's direction and the way to it, along the core point's direction e and along the core's tangent there.
+            // Components of the ray's direction and of the vector to it, along the core point's direction e and along
+            // the core's tangent there.
             let (de, dt) = (d1 * c + d2 * s, d2 * c - d1 * s);
             let (qe, qt) = (q1 * c + q2 * s, q2 * c - q1 * s);
             let slope = core * (qt - core * de * dt);
@@ -124,21 +127,21 @@ impl Torus {
         (distance > 0.0 && slope > 0.0 && slope.is_finite()).then_some(Closest { e, w, distance, slope, gradient })
     }
 
-    /// How far a ray's edge point is from the outline, pixels, in which direction of the image that grows, and the bar's point that the ray
-    /// comes closest to.
+    /// Distance of a ray's edge point from the outline in pixels, its gradient direction in the image, and the point
+    /// of the bar that the ray comes closest to.
     pub(crate) fn touch(&self, ray: &Ray) -> Option<(f64, Vector2<f64>, Vector3<f64>)> {
         let c = self.closest(ray, &self.axes())?;
         let foot = self.centre + c.e * self.core + c.w * self.bar;
         Some(((c.distance - self.bar) / c.slope, c.gradient, foot))
     }
 
-    /// Residual of a ray in pixels: how far the edge point is from the outline, positive away from the bar.
+    /// Distance of a ray's edge point from the outline in pixels, positive away from the bar.
     pub(crate) fn residual(&self, ray: &Ray) -> f64 {
         self.closest(ray, &self.axes()).map_or(f64::NAN, |c| (c.distance - self.bar) / c.slope)
     }
 }
 
-/// Sine and cosine of an angle of at most 0.3 by its series, to the last digit.
+/// Sine and cosine of an angle of at most 0.3 by their series, to machine precision.
 fn sin_cos_of_step(x: f64) -> (f64, f64) {
     let y = x * x;
     let sin = 1.0 - y / 6.0 * (1.0 - y / 20.0 * (1.0 - y / 42.0 * (1.0 - y / 72.0 * (1.0 - y / 110.0))));
@@ -147,16 +150,16 @@ fn sin_cos_of_step(x: f64) -> (f64, f64) {
     (x * sin, cos)
 }
 
-/// Which of the torus' parameters are adjusted.
+/// Which parameters of the torus are adjusted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Free {
     /// Centre, normal, core and bar radius.
     All,
     /// The bar's radius is known.
     KnownBar,
-    /// One view fixes everything but the scale: the core radius is held.
+    /// One view determines everything but the scale: the core radius is fixed.
     OneView,
-    /// Both radii are held: one outline of one view determines no more than the pose.
+    /// Both radii are fixed: one outline of one view determines only the pose.
     Pose,
 }
 
@@ -167,33 +170,35 @@ pub(crate) struct TorusFit {
     /// Weighted sum of squared residuals over the rays kept.
     pub(crate) chi2: f64,
     pub(crate) parameters: usize,
-    /// Inverse normal matrix of centre, normal (columns of [`frame_of`]), and the free radii; `None` when it is singular.
+    /// Inverse normal matrix of centre, normal (columns of [`frame_of`]), and the free radii; `None` when it is
+    /// singular.
     pub(crate) cofactor: Option<SMatrix<f64, 7, 7>>,
 }
 
-/// The least-squares problem with the pixel scale of every ray held: repeated until the scales stand still.
+/// The least-squares problem with the pixel scale of every ray fixed; repeated until the scales converge.
 struct Fit<'a> {
     rays: &'a [Ray],
-    /// `1 / (sigma slope)` of each ray: turns a distance into a residual in units of sigma.
+    /// `1 / (sigma slope)` of each ray: converts a distance to a residual in units of sigma.
     weight: &'a [f64],
     unit: f64,
     free: Free,
-    /// Where the rays come closest to the last torus asked for: a step is first tried, then linearised at the same place.
+    /// Closest approaches to the last torus: a step is first tried, then linearised at the same state.
     closest: &'a RefCell<Approach>,
 }
 
-/// A torus and where every ray comes closest to its core.
+/// A torus with the closest approach of every ray.
 struct Approach {
     torus: Torus,
     axes: Axes,
     closest: Vec<Closest>,
-    /// Whether all do.
-    whole: bool,
+    /// Whether every ray has one.
+    complete: bool,
 }
 
 impl Approach {
     fn new(rays: &[Ray], torus: &Torus) -> Self {
-        let mut new = Self { torus: *torus, axes: torus.axes(), closest: Vec::with_capacity(rays.len()), whole: false };
+        let mut new =
+            Self { torus: *torus, axes: torus.axes(), closest: Vec::with_capacity(rays.len()), complete: false };
         new.fill(rays);
         new
     }
@@ -201,16 +206,16 @@ impl Approach {
     fn fill(&mut self, rays: &[Ray]) {
         self.closest.clear();
         self.closest.extend(rays.iter().map_while(|r| self.torus.closest(r, &self.axes)));
-        self.whole = self.closest.len() == rays.len();
+        self.complete = self.closest.len() == rays.len();
     }
 
-    /// Moves to another torus; `None` where a ray has no closest place.
+    /// Changes the torus; `None` where a ray has no closest approach.
     fn at(&mut self, rays: &[Ray], torus: &Torus) -> Option<(&Axes, &[Closest])> {
         if self.torus != *torus {
             (self.torus, self.axes) = (*torus, torus.axes());
             self.fill(rays);
         }
-        self.whole.then_some((&self.axes, &self.closest))
+        self.complete.then_some((&self.axes, &self.closest))
     }
 }
 
@@ -231,11 +236,11 @@ impl Problem<7> for Fit<'_> {
         let n = self.parameters();
         let mut cost = 0.0;
         let mut gradient = [0.0; 7];
-        // All seven, whatever is free: loops of known length are quicker than fewer turns.
+        // All seven parameters, whatever is adjusted: loops of known length are faster than fewer iterations.
         let mut normal = [[0.0; 7]; 7];
         for (c, weight) in closest.iter().zip(self.weight) {
             let r = (c.distance - x.bar) * weight;
-            // The foot's own motion does not count: it is the closest point (envelope theorem).
+            // The motion of the closest point itself does not count (envelope theorem).
             let k = self.unit * weight;
             let tip = x.core * c.w.dot(&x.normal) * weight;
             let (by_core, by_bar) = (-c.w.dot(&c.e) * k, -k);
@@ -285,7 +290,7 @@ impl Problem<7> for Fit<'_> {
     }
 }
 
-/// Fits a torus to rays from a start.
+/// Fits a torus to rays from a start; `None` when the fit leaves the admissible range.
 pub(crate) fn fit(rays: &[Ray], keep: &[bool], start: &Torus, free: Free) -> Option<TorusFit> {
     let rays: Vec<Ray> = rays.iter().zip(keep).filter(|(_, k)| **k).map(|(r, _)| *r).collect();
     let unit = start.core;
@@ -313,7 +318,7 @@ pub(crate) fn fit(rays: &[Ray], keep: &[bool], start: &Torus, free: Free) -> Opt
             break;
         }
     }
-    // The last scales belong to the state before the last: the cost that counts is the one in pixels at the end.
+    // The last scales belong to the previous state: recompute the cost in pixels at the end.
     if let Some(f) = &mut found {
         let mut approach = approach.borrow_mut();
         let (_, closest) = approach.at(&rays, &f.torus)?;
@@ -323,13 +328,15 @@ pub(crate) fn fit(rays: &[Ray], keep: &[bool], start: &Torus, free: Free) -> Opt
     found
 }
 
-/// Points of a torus' outline seen from a place: outer and inner solution at every core angle (each `None` where there is none).
+/// Points of the torus's outline seen from `centre`: outer and inner solution at a core angle; `None` where there is
+/// none.
 ///
-/// At core direction `e` the tube's angle `v` obeys `A cos v + B sin v = -r`, `A = e . (C + R e - O)`, `B = n . (C + R e - O)`.
-pub fn outline(torus: &Torus, eye: &Vector3<f64>, angle: f64) -> Option<[Vector3<f64>; 2]> {
+/// At core direction `e` the tube's angle `v` satisfies `A cos v + B sin v = -r`, `A = e . (C + R e - O)`, `B = n . (C
+/// + R e - O)`.
+pub fn outline(torus: &Torus, centre: &Vector3<f64>, angle: f64) -> Option<[Vector3<f64>; 2]> {
     let axes = torus.axes();
     let e = axes.e1 * angle.cos() + axes.e2 * angle.sin();
-    let d = torus.centre + e * torus.core - eye;
+    let d = torus.centre + e * torus.core - centre;
     let (a, b) = (e.dot(&d), torus.normal.dot(&d));
     let h = a.hypot(b);
     if !(h > torus.bar) {

@@ -4,7 +4,8 @@ use nalgebra::{SMatrix, SVector};
 
 /// Eigenvalues in ascending order and unit eigenvectors (columns) of a symmetric matrix, by at most 40 Jacobi sweeps.
 ///
-/// Small eigenvalues keep their absolute accuracy (about 1e-16 of the largest). Not finite in, not finite out; never loops on.
+/// Small eigenvalues keep their absolute accuracy (about 1e-16 of the largest). Input that is not finite gives output
+/// that is not finite; the loop always ends.
 pub fn symmetric<const N: usize>(m: &SMatrix<f64, N, N>) -> (SVector<f64, N>, SMatrix<f64, N, N>) {
     let mut a = (m + m.transpose()) * 0.5;
     let mut v = SMatrix::<f64, N, N>::identity();
@@ -99,7 +100,8 @@ pub fn solve<const N: usize>(l: &SMatrix<f64, N, N>, b: &SVector<f64, N>, n: usi
     x
 }
 
-/// Inverse of a symmetric positive definite leading block, scaled to unit diagonal first; rows and columns from `n` on are zero.
+/// Inverse of a symmetric positive definite leading block, scaled to unit diagonal first. Rows and columns from `n` on
+/// are zero. `None` when a pivot is not clearly positive.
 pub fn invert<const N: usize>(m: &SMatrix<f64, N, N>, n: usize) -> Option<SMatrix<f64, N, N>> {
     let mut d = SVector::<f64, N>::zeros();
     for i in 0..n {
@@ -137,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn not_finite_or_indefinite_is_refused_and_ends() {
+    fn non_finite_or_indefinite_input_is_refused() {
         let (w, _) = symmetric(&Matrix4::from_element(f64::NAN));
         assert!(!w[0].is_finite());
         assert!(invert(&Matrix4::from_diagonal(&Vector4::new(1.0, -1.0, 1.0, 1.0)), 4).is_none());
@@ -145,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn inverse_of_a_badly_scaled_matrix() {
+    fn a_badly_scaled_matrix_is_inverted() {
         let d = Vector4::new(1e-6, 1.0, 1e6, 3.0);
         let b = Matrix4::new(2.0, 0.1, 0.2, 0.0, 0.1, 3.0, 0.4, 0.2, 0.2, 0.4, 1.0, 0.3, 0.0, 0.2, 0.3, 1.5);
         let m = Matrix4::from_diagonal(&d) * b * Matrix4::from_diagonal(&d);

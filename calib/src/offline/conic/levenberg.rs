@@ -1,4 +1,4 @@
-//! A bounded Levenberg-Marquardt over any state with a local chart of order one.
+//! A bounded Levenberg-Marquardt minimiser over any state with a first-order local chart.
 
 use crate::offline::conic::eigen;
 use nalgebra::{SMatrix, SVector};
@@ -14,17 +14,17 @@ pub(crate) struct Linear<const N: usize> {
 pub(crate) trait Problem<const N: usize> {
     type State: Clone;
     fn parameters(&self) -> usize;
-    /// `None` where the state is not admissible.
+    /// `None` where the state is inadmissible.
     fn linearise(&self, state: &Self::State) -> Option<Linear<N>>;
     fn cost(&self, state: &Self::State) -> Option<f64>;
     fn step(&self, state: &Self::State, d: &SVector<f64, N>) -> Self::State;
 }
 
-/// Where a minimisation ended.
+/// Result of a minimisation.
 pub(crate) struct Minimum<S, const N: usize> {
     pub(crate) state: S,
     pub(crate) cost: f64,
-    /// Gauss-Newton normal matrix there: its inverse times the noise variance is the covariance.
+    /// Gauss-Newton normal matrix at the minimum: its inverse times the noise variance is the covariance.
     pub(crate) normal: SMatrix<f64, N, N>,
     /// Whether the last step was negligible.
     pub(crate) converged: bool,
@@ -55,7 +55,8 @@ pub(crate) fn minimise<const N: usize, P: Problem<N>>(
             if let Some(l) = eigen::cholesky(&damped, n) {
                 let d = -eigen::solve(&l, &at.gradient, n);
                 let next = problem.step(&state, &d);
-                // Close to the minimum the cost is flat to rounding: a step that does not raise it by more than that is good.
+                // Close to the minimum the cost is flat to rounding: a step that does not raise it by more than that
+                // is accepted.
                 if let Some(cost) = problem.cost(&next)
                     && cost <= at.cost * (1.0 + 1e-14)
                 {
@@ -66,7 +67,8 @@ pub(crate) fn minimise<const N: usize, P: Problem<N>>(
             mu = (mu * 10.0).max(1e-9);
         }
         let Some((next, size, cost)) = accepted else {
-            // No step lowers the cost: the minimum to rounding if the full step is nil or promises nothing.
+            // No step lowers the cost. This is the minimum to rounding if the full step is negligible, or its
+            // predicted gain is.
             converged = full_step(&at, n).is_some_and(|(size, gain)| size <= 1e-8 || gain <= 1e-9 * at.cost);
             break;
         };
@@ -82,7 +84,7 @@ pub(crate) fn minimise<const N: usize, P: Problem<N>>(
     at.cost.is_finite().then_some(Minimum { state, cost: at.cost, normal: at.normal, converged })
 }
 
-/// Length of the undamped step, and the decrease of the cost that it promises.
+/// Length of the undamped step, and its predicted decrease of the cost.
 fn full_step<const N: usize>(at: &Linear<N>, n: usize) -> Option<(f64, f64)> {
     let l = eigen::cholesky(&at.normal, n)?;
     let d = eigen::solve(&l, &at.gradient, n);

@@ -1,32 +1,32 @@
-//! Gross outliers in one view: a deterministic consensus for the start, then a redescending gate round the geometric fit.
+//! The ellipse fit with gross outliers in one view: a deterministic consensus start, then a redescending gate around
+//! the geometric fit.
 //!
-//! A gate (truncated quadratic) at 3.5 robust standard deviations keeps 99.95 % of Gaussian noise, so that the estimate stays at the
-//! inliers' Cramer-Rao bound, and forgets everything farther away.
+//! A gate (truncated quadratic) at 3.5 robust standard deviations keeps 99.95 % of Gaussian noise, so that the
+//! estimate stays at the inliers' Cramer-Rao bound, and gives no weight to points beyond it.
 
 use crate::offline::conic::sampson::distance;
 use crate::offline::conic::{EllipseFit, FitError, ellipse_of, fit_direct, fit_ml, refine};
-use crate::offline::rim::model::{EdgePoint, Scatter};
+use crate::offline::statistics::{MAD, median};
+use crate::offline::types::{EdgePoint, Scatter};
 use nalgebra::Matrix3;
 
-/// The gate in robust standard deviations.
+/// Largest residual of an inlier, robust standard deviations.
 pub const GATE: f64 = 3.5;
 
-/// The rest of a Gaussian cut off at the gate has a standard deviation smaller by this.
-const WIDEN: f64 = 1.003;
+/// Ratio of the standard deviation of a Gaussian to that of the Gaussian truncated at the gate.
+const TRUNCATION: f64 = 1.003;
 
-/// Steps along the contour, in medians, within which a point needs two neighbours.
-const LONELY: f64 = 8.0;
-
-/// A median absolute deviation times this is a standard deviation for Gaussian noise.
-const MAD: f64 = 1.482_602_218_505_602;
+/// Largest distance to the second nearest neighbour along the contour, in median steps: a point farther away is
+/// isolated.
+const MAX_ISOLATION_STEPS: f64 = 8.0;
 
 /// Samples of five points: with 20 % outliers one in three is clean, with 40 % one in thirteen.
 const SAMPLES: usize = 120;
 
-/// Samples that check an innocent-looking plain fit.
+/// Samples that check a plain fit whose residuals look like noise.
 const PROBES: usize = 24;
 
-/// A robust ellipse fit and the points it stands on.
+/// A robust ellipse fit and its inliers.
 #[derive(Clone, Debug)]
 pub struct RobustFit {
     /// The geometric fit to the inliers.
@@ -35,18 +35,22 @@ pub struct RobustFit {
     pub inliers: Vec<bool>,
 }
 
-/// Fits an ellipse to points some of which may not belong to it at all (up to about 40 %).
+/// Fits an ellipse to points of which up to about 40 % are outliers.
 ///
-/// Points without outliers give exactly the plain fit. Deterministic: the same points in the same order give the same bits.
+/// Points without outliers give exactly the plain fit. Deterministic: the same points in the same order give the same
+/// bits.
+///
+/// # Errors
+/// [`FitError`] as the plain fit.
 pub fn fit(points: &[EdgePoint], scatter: Scatter) -> Result<RobustFit, FitError> {
     let plain = fit_ml(points, scatter);
     if let Ok(fit) = &plain
-        && clean(points, fit)
-        && !bettered(points, fit)
+        && is_clean(points, fit)
+        && !is_beaten(points, fit)
     {
         return Ok(RobustFit { fit: fit.clone(), inliers: vec![true; points.len()] });
     }
-    // Too few points to tell an outlier from noise: the plain answer, or the plain refusal, is the honest one.
+    // Too few points to separate an outlier from noise: return the plain fit, or its error.
     if points.len() < 10 {
         return plain.map(|fit| RobustFit { fit, inliers: vec![true; points.len()] });
     }
@@ -57,13 +61,14 @@ pub fn fit(points: &[EdgePoint], scatter: Scatter) -> Result<RobustFit, FitError
     polish(points, &start, scatter)
 }
 
-/// Whether the residuals look like noise: no point beyond the gate (widened for the largest of many), and no heavy tail.
-fn clean(points: &[EdgePoint], fit: &EllipseFit) -> bool {
+/// Whether the residuals look like noise: no point beyond the gate (widened for the largest of many), and no heavy
+/// tail.
+fn is_clean(points: &[EdgePoint], fit: &EllipseFit) -> bool {
     let r = residuals(points, &fit.conic);
     let scale = MAD * median(r.clone());
     let largest = r.iter().copied().fold(0.0, f64::max);
     largest <= 4.5 * scale && fit.noise <= 1.25 * scale
-        // Exact points: everything is rounding.
+        // Exact points: all residuals are rounding.
         || largest <= 1e-7
 }
 
@@ -72,23 +77,9 @@ fn residuals(points: &[EdgePoint], c: &Matrix3<f64>) -> Vec<f64> {
     points.iter().map(|p| (distance(c, &p.uv) / p.sigma).abs()).collect()
 }
 
-/// Median; infinite for nothing. Not finite values count as infinite.
-pub(crate) fn median(mut v: Vec<f64>) -> f64 {
-    if v.is_empty() {
-        return f64::INFINITY;
-    }
-    for x in &mut v {
-        if !x.is_finite() {
-            *x = f64::INFINITY;
-        }
-    }
-    let k = v.len() / 2;
-    *v.select_nth_unstable_by(k, f64::total_cmp).1
-}
-
-/// Whether a handful of samples shows that a smaller set explains the points far better than the plain fit does: a spoke or a second
-/// contour bends the plain fit without leaving a single large residual.
-fn bettered(points: &[EdgePoint], fit: &EllipseFit) -> bool {
+/// Whether a few samples show that a subset explains the points far better than the plain fit does: a spoke or a
+/// second contour bends the plain fit without leaving a single large residual.
+fn is_beaten(points: &[EdgePoint], fit: &EllipseFit) -> bool {
     let plain = median(residuals(points, &fit.conic));
     points.len() >= 10 && plain > 1e-7 && consensus(points, None, PROBES).is_some_and(|(m, _)| m < 0.6 * plain)
 }
@@ -108,30 +99,30 @@ fn consensus(points: &[EdgePoint], plain: Option<&EllipseFit>, samples: usize) -
     best
 }
 
-/// Alternates gate and geometric fit until the set of inliers stands still.
+/// Alternates gate and geometric fit until the set of inliers stops changing.
 ///
-/// The first scale is a median over all points, which outliers widen (by a third when one point in five is one); from then on it is that of
-/// the points kept, so that the gate closes to what the inliers themselves ask for.
+/// The first scale is a median over all points, which outliers increase (by a third for 20 % outliers). Later scales
+/// are those of the inliers, so that the gate narrows to their own noise.
 fn polish(points: &[EdgePoint], start: &Matrix3<f64>, scatter: Scatter) -> Result<RobustFit, FitError> {
     let mut conic = *start;
     let mut inliers = vec![false; points.len()];
     let mut last: Option<EllipseFit> = None;
     for round in 0..25 {
         let r = residuals(points, &conic);
-        // Five points fit themselves: the first scale is widened for that (Rousseeuw's small-sample factor).
+        // Five points fit themselves: Rousseeuw's small-sample factor corrects the first scale for that.
         let first = MAD * median(r.clone()) * (1.0 + 5.0 / (points.len() as f64 - 5.0).max(1.0));
         let (width, scale) = match &last {
             None => (2.5, first),
-            Some(fit) => (GATE, (fit.noise * WIDEN).min(first)),
+            Some(fit) => (GATE, (fit.noise * TRUNCATION).min(first)),
         };
         let gate = width * scale.max(1e-9);
         let mut next: Vec<bool> = r.iter().map(|x| *x <= gate).collect();
         if round > 0 {
-            drop_lonely(points, &conic, &mut next);
+            drop_isolated(points, &conic, &mut next);
         }
-        let settled = round > 1 && next == inliers;
+        let unchanged = round > 1 && next == inliers;
         inliers = next;
-        if settled {
+        if unchanged {
             break;
         }
         let kept: Vec<EdgePoint> = points.iter().zip(&inliers).filter(|(_, k)| **k).map(|(p, _)| *p).collect();
@@ -146,11 +137,12 @@ fn polish(points: &[EdgePoint], start: &Matrix3<f64>, scatter: Scatter) -> Resul
     Ok(RobustFit { fit, inliers })
 }
 
-/// Drops points that stand alone in a gap of the contour.
+/// Drops isolated points in a gap of the contour.
 ///
-/// Where part of the rim is hidden, a single stray point on the missing part bends the ellipse to itself and then lies within any gate: its
-/// residual says nothing. A contour's own points come in runs; one without two neighbours within a few steps has no witness.
-fn drop_lonely(points: &[EdgePoint], conic: &Matrix3<f64>, kept: &mut [bool]) {
+/// Where part of the rim is hidden, a single stray point on the missing part bends the ellipse towards itself and then
+/// lies within any gate: its residual is uninformative. The points of a contour come in runs; a point without two
+/// neighbours within a few steps is not confirmed by others.
+fn drop_isolated(points: &[EdgePoint], conic: &Matrix3<f64>, kept: &mut [bool]) {
     let Some(e) = ellipse_of(conic) else { return };
     let (s, c) = e.theta.sin_cos();
     let mut around: Vec<(f64, usize)> = points
@@ -170,10 +162,10 @@ fn drop_lonely(points: &[EdgePoint], conic: &Matrix3<f64>, kept: &mut [bool]) {
     around.sort_by(|a, b| a.0.total_cmp(&b.0));
     let at = |k: usize| points[around[k % n].1].uv;
     let step: Vec<f64> = (0..n).map(|k| (at(k + 1) - at(k)).norm()).collect();
-    let far = LONELY * median(step.clone());
+    let far = MAX_ISOLATION_STEPS * median(step.clone());
     let gap = |k: usize| step[k % n];
     for k in 0..n {
-        // The second nearest of the neighbours along the contour: two before, one on each side, or two after.
+        // The second nearest neighbour along the contour: two before, one on each side, or two after.
         let (b1, a1) = (gap(k + n - 1), gap(k));
         let (b2, a2) = (b1 + gap(k + n - 2), a1 + gap(k + 1));
         if b2.min(a2).min(b1.max(a1)) > far {
@@ -193,7 +185,7 @@ impl XorShift {
         self.0
     }
 
-    /// Five points anywhere. Not one from each fifth of the contour: a spoke spoils a whole stretch of it.
+    /// Five random points. Not one from each fifth of the contour: a spoke corrupts a whole stretch of it.
     fn five(&mut self, points: &[EdgePoint]) -> Vec<EdgePoint> {
         let mut chosen: Vec<usize> = Vec::with_capacity(5);
         for _ in 0..20 {
@@ -213,7 +205,7 @@ impl XorShift {
 mod tests {
     use super::*;
     use crate::offline::conic::conic_of;
-    use crate::offline::rim::model::Ellipse2;
+    use crate::offline::types::Ellipse2;
     use nalgebra::Vector2;
 
     fn points(outliers: usize, clustered: bool) -> (Vec<EdgePoint>, Ellipse2) {

@@ -1,10 +1,12 @@
-//! First-order (Sampson) distances of edge points to a conic, gathered into normal equations in the conic's own six coefficients.
+//! First-order (Sampson) distances of edge points to a conic, accumulated into normal equations in the conic's six
+//! coefficients.
 //!
-//! Every model of this crate that predicts a conic in an image is fitted through the same sums: with the derivative `D` (6 x p) of
-//! the coefficients by the model's parameters, the normal equations are `D^T A D` and `D^T g`. One pass over the points costs the
-//! same whatever the model, which is why a two-view fit with covariance takes a fraction of a millisecond.
+//! Every model that predicts a conic in an image is fitted through the same sums: with the derivative `D` (6 x p) of
+//! the coefficients by the model's parameters, the normal equations are `D^T A D` and `D^T g`. One pass over the
+//! points costs the same for every model, which is why a two-view fit with covariance takes a fraction of a
+//! millisecond.
 
-use crate::offline::rim::model::{EdgePoint, Scatter};
+use crate::offline::types::{EdgePoint, Scatter};
 use nalgebra::{Matrix3, SMatrix, SVector, Vector2};
 
 /// Coefficients `c00, c01, c11, c02, c12, c22` of a symmetric 3x3 conic.
@@ -22,12 +24,12 @@ pub struct Cloud {
     pub centre: Vector2<f64>,
     /// Unit of the frame, pixels.
     pub scale: f64,
-    /// How the points scatter about the curve.
+    /// Direction in which the points scatter about the curve.
     pub scatter: Scatter,
     points: Vec<Entry>,
 }
 
-/// A point in the frame, and `scale / sigma`: what turns a distance in the frame into one in units of sigma.
+/// A point in the frame, and `scale / sigma`, which converts a distance in the frame to units of sigma.
 #[derive(Clone, Copy, Debug)]
 struct Entry {
     x: f64,
@@ -47,7 +49,7 @@ pub struct Sums {
 }
 
 impl Cloud {
-    /// The points in a frame at `centre` with unit `scale`; points whose `keep` is false are left out.
+    /// The points in a frame with origin `centre` and unit `scale`. Points whose `keep` is false are left out.
     pub fn new(
         points: &[EdgePoint],
         keep: Option<&[bool]>,
@@ -116,7 +118,8 @@ impl Cloud {
         chi2
     }
 
-    /// The same with the normal equations in the conic's coefficients. The distance is `r = q / (2 |w|)`, `q = u^T C u`, `w = (C u)_xy`.
+    /// As [`Self::chi2`], with the normal equations in the conic's coefficients. The distance is `r = q / (2 |w|)`
+    /// with `q = u^T C u` and `w = (C u)_xy`.
     pub fn sums(&self, c: &Coefficients) -> Sums {
         let [c00, c01, c11, c02, c12, c22] = c.data.0[0];
         let mut chi2 = 0.0;
@@ -158,7 +161,8 @@ impl Cloud {
     }
 }
 
-/// Turns a first-order distance and its derivative into the orthogonal distance `d + kappa d^2 / 2`, `kappa` the curvature there.
+/// Converts a first-order distance and its derivative to the orthogonal distance `d + kappa d^2 / 2`, with the
+/// curvature `kappa` at the point.
 fn orthogonal(r: f64, dr: [f64; 6], p: &Entry, c: [f64; 3], w: [f64; 2]) -> (f64, [f64; 6]) {
     let ([c00, c01, c11], [wx, wy]) = (c, w);
     let n2 = wx * wx + wy * wy;
@@ -168,7 +172,7 @@ fn orthogonal(r: f64, dr: [f64; 6], p: &Entry, c: [f64; 3], w: [f64; 2]) -> (f64
     let dwx = [p.x, p.y, 0.0, 1.0, 0.0, 0.0];
     let dwy = [0.0, p.x, p.y, 0.0, 1.0, 0.0];
     let direct = [wy * wy, -2.0 * wx * wy, wx * wx, 0.0, 0.0, 0.0];
-    // Distances are weighted here; the plain one is d = r / weight.
+    // Distances are in units of sigma here; in the frame the distance is d = r / weight.
     let d = r / p.weight;
     let out = core::array::from_fn(|i| {
         let bend = (direct[i] + by_wx * dwx[i] + by_wy * dwy[i]) / n3;

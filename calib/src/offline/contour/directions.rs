@@ -1,22 +1,24 @@
-//! Which directions edges have near each pixel: a look-up that tells most places of a wrong trial ellipse from those of a right one.
+//! Look-up of the edge directions near each pixel: it rejects most points of a wrong trial ellipse without a search.
 //!
-//! A trial ellipse is judged at up to 160 places, and a seed has a thousand trials. At most places of a wrong one there are edges, but of other
-//! directions. So each pixel remembers which sectors of normals an edge in reach could answer. A normal in any other sector has no edge for certain; for
-//! the rest the edges themselves are looked at. Pixels are made ready by the tile, when the first of it is asked for: most of an image never is.
+//! A trial ellipse is scored at up to 160 points, and a seed has about a thousand trials. Near most points of a wrong
+//! ellipse there are edges, but with other directions. Each pixel therefore stores, as bits, the sectors of normals
+//! that an edge within reach could match. A normal in any other sector certainly has no edge; for the rest the edges
+//! themselves are searched. Pixels are filled tile by tile on first access: most of an image is never used.
 
-use super::ViewEdges;
+use crate::offline::edges::EdgeMap;
+use crate::offline::edges::arcs::IdealEdges;
 use graspd_rt::geom::Pixel;
 use std::cell::OnceCell;
 
 /// Side of a tile, pixels: its words fill one page of memory.
 const TILE: usize = 32;
-/// Pixels that the search round a place reaches to each side of it at most.
-pub(super) const REACH: i32 = 3;
-/// Cosine of the largest angle between an edge's direction and the normal that it answers.
-pub(super) const ALONG: f64 = 0.94;
-/// A little more than that angle, 19.95 degrees, so that rounding at a sector's end cannot lose an edge.
+/// Largest distance to either side that the search around a point covers, pixels.
+pub(super) const REACH_PX: i32 = 3;
+/// Cosine of the largest angle between an edge's direction and a normal that it matches.
+pub(super) const MIN_COSINE: f64 = 0.94;
+/// Slightly more than that angle (19.95 degrees), so that rounding at the end of a sector cannot lose an edge.
 const ANGLE_DEG: f64 = 20.0;
-/// Sectors of a quarter turn: the whole turn fits a word.
+/// Sectors of a quarter turn: the full turn fits one word.
 const QUARTER: u32 = 8;
 
 type Tile = [[u32; TILE]; TILE];
@@ -33,9 +35,37 @@ impl Directions {
         let columns = width.div_ceil(TILE);
         Self { columns, tiles: vec![OnceCell::new(); columns * height.div_ceil(TILE)] }
     }
+
+    /// Whether an edge within reach of a raw pixel could have the direction `towards_bright` (ideal pixels) to within
+    /// [`MIN_COSINE`]. The pixel must be inside the image.
+    pub(super) fn may_have_edge(&self, edges: (&EdgeMap, &IdealEdges), raw: Pixel, towards_bright: Pixel) -> bool {
+        let (x, y) = (raw.x.round() as usize, raw.y.round() as usize);
+        let Some(tile) = self.tiles.get(y / TILE * self.columns + x / TILE) else { return true };
+        let tile = tile.get_or_init(|| fill_tile(edges, x / TILE * TILE, y / TILE * TILE));
+        tile[y % TILE][x % TILE] & 1 << sector(towards_bright) != 0
+    }
 }
 
-/// Sector of a direction. The sectors follow the angle round in equal steps of `|y| / (|x| + |y|)`, which needs no arc tangent.
+/// Fills the tile whose first pixel is `(x0, y0)`.
+fn fill_tile((map, ideal): (&EdgeMap, &IdealEdges), x0: usize, y0: usize) -> Box<Tile> {
+    let mut tile = Box::new([[0u32; TILE]; TILE]);
+    let first = Pixel::new(x0 as f64, y0 as f64);
+    map.within(first, first.add_scalar((TILE - 1) as f64), REACH_PX, |k, column, row| {
+        let Some(edge) = ideal.get(k) else { return };
+        let sectors = sectors_round(edge.towards_bright);
+        let span = |at: usize, start: usize| {
+            let reach = REACH_PX as usize;
+            (at.saturating_sub(reach).max(start) - start)..(at + reach + 1).min(start + TILE) - start
+        };
+        for line in tile.get_mut(span(row, y0)).unwrap_or(&mut []) {
+            line.get_mut(span(column, x0)).unwrap_or(&mut []).iter_mut().for_each(|w| *w |= sectors);
+        }
+    });
+    tile
+}
+
+/// Sector of a direction. The sectors follow the angle in equal steps of `|y| / (|x| + |y|)`, which needs no arc
+/// tangent.
 fn sector(d: Pixel) -> u32 {
     let part = d.y.abs() / (d.x.abs() + d.y.abs());
     let quarters = match (d.x >= 0.0, d.y >= 0.0) {
@@ -56,43 +86,15 @@ fn sectors_round(d: Pixel) -> u32 {
     ((1u32 << count) - 1).rotate_left(from)
 }
 
-impl ViewEdges<'_> {
-    /// Whether an edge in reach of a raw pixel inside the image could have the direction `towards_bright`, ideal pixels, to within [`ALONG`].
-    pub(super) fn may_have_edge(&self, raw: Pixel, towards_bright: Pixel) -> bool {
-        let d = &self.directions;
-        let (x, y) = (raw.x.round() as usize, raw.y.round() as usize);
-        let Some(tile) = d.tiles.get(y / TILE * d.columns + x / TILE) else { return true };
-        let tile = tile.get_or_init(|| self.tile(x / TILE * TILE, y / TILE * TILE));
-        tile[y % TILE][x % TILE] & 1 << sector(towards_bright) != 0
-    }
-
-    /// Makes the tile whose first pixel this is.
-    fn tile(&self, x0: usize, y0: usize) -> Box<Tile> {
-        let mut tile = Box::new([[0u32; TILE]; TILE]);
-        let first = Pixel::new(x0 as f64, y0 as f64);
-        self.map.within(first, first.add_scalar((TILE - 1) as f64), REACH, |k, column, row| {
-            let Some(edge) = self.arcs.ideal.get(k) else { return };
-            let sectors = sectors_round(edge.towards_bright);
-            let span = |at: usize, start: usize| {
-                let reach = REACH as usize;
-                (at.saturating_sub(reach).max(start) - start)..(at + reach + 1).min(start + TILE) - start
-            };
-            for line in tile.get_mut(span(row, y0)).unwrap_or(&mut []) {
-                line.get_mut(span(column, x0)).unwrap_or(&mut []).iter_mut().for_each(|w| *w |= sectors);
-            }
-        });
-        tile
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::offline::contour::ViewEdges;
     use crate::offline::edges::grey_image::GreyImage;
     use graspd_rt::geom::{Camera, Distortion};
 
     #[test]
-    fn no_edge_that_answers_a_normal_is_lost_and_most_normals_have_none() {
+    fn no_matching_edge_is_lost_and_most_normals_have_none() {
         let distortion = Distortion { k1: -0.15, k2: 0.04, p1: 1e-3, ..Distortion::default() };
         let camera = Camera { width: 200, height: 170, fx: 180.0, fy: 178.0, cx: 99.0, cy: 84.0, distortion };
         // Stripes and discs: edges of every direction, up to the border.
@@ -102,7 +104,7 @@ mod tests {
         let data = (0..200 * 170).map(|i| grey(f64::from(i % 200), f64::from(i / 200)) as u8).collect();
         let image = GreyImage::new(200, 170, data).unwrap();
         let view = ViewEdges::new(&image, &camera);
-        let (mut answered, mut passed, mut asked) = (0, 0, 0);
+        let (mut matched, mut passed, mut asked) = (0, 0, 0);
         for i in 0..4000 {
             let at =
                 Pixel::new(6.0 + 187.0 * (f64::from(i) * 0.618).fract(), 6.0 + 157.0 * (f64::from(i) * 0.414).fract());
@@ -110,15 +112,15 @@ mod tests {
             let n = Pixel::new(cos, sin);
             let has = view
                 .map
-                .near(at, REACH)
-                .any(|(k, _)| view.arcs.ideal.get(k).is_some_and(|e| e.towards_bright.dot(&n) > ALONG));
+                .near(at, REACH_PX)
+                .any(|(k, _)| view.arcs.ideal.get(k).is_some_and(|e| e.towards_bright.dot(&n) > MIN_COSINE));
             let may = view.may_have_edge(at, n);
             assert!(may || !has, "{at} {n}");
             asked += 1;
-            answered += usize::from(has);
+            matched += usize::from(has);
             passed += usize::from(may);
         }
-        assert!(answered > 200 && passed < 2 * answered && 2 * passed < asked, "{answered} {passed} {asked}");
+        assert!(matched > 200 && passed < 2 * matched && 2 * passed < asked, "{matched} {passed} {asked}");
     }
 
     #[test]

@@ -1,40 +1,43 @@
-//! Edge points along a curve that is known beforehand: the outline that a model predicts, followed in the image.
+//! Edge points along a curve that a model predicts.
 //!
-//! Growing a contour asks which edges lie on one ellipse. Here the curve is given (the outline of a bar is no ellipse), and only the edges next to
-//! it are wanted, one for each stretch that is independent of its neighbours, told apart from nearby ones and brought to their place.
+//! Growing a contour asks which edges lie on one ellipse. Here the curve is given (the outline of a bar is not an
+//! ellipse). Only the edges next to it are collected, one for each stretch that is independent of its neighbours,
+//! separated from nearby edges and refined.
 
+use crate::offline::contour::one_ellipse::{Contour, ContourPoint, FLOOR_PX, INDEPENDENT_PX, MIN_COVERAGE};
 use crate::offline::contour::quick_fit::{Sums, Walk};
-use crate::offline::contour::{Contour, ContourPoint, FLOOR_PX, INDEPENDENT_PX, LEAST_COVERAGE, ViewEdges};
+use crate::offline::contour::view_edges::ViewEdges;
 use crate::offline::edges::Refined;
-use crate::offline::rim::model::{EdgePoint, Outline};
+use crate::offline::types::{EdgePoint, Outline};
 use graspd_rt::geom::Pixel;
 
-/// A place on a predicted curve, ideal pixels.
+/// A point of a predicted curve, ideal pixels.
 #[derive(Clone, Copy, Debug)]
-pub(in crate::offline) struct Place {
+pub(in crate::offline) struct CurvePoint {
     pub(in crate::offline) at: Pixel,
-    /// Unit normal, to the outside of the outline.
+    /// Unit normal, towards the outside of the outline.
     pub(in crate::offline) normal: Pixel,
-    /// Signed radius of curvature, positive where the inside of the curve lies against the normal.
+    /// Signed radius of curvature, positive where the centre of curvature is opposite to the normal.
     pub(in crate::offline) radius: f64,
 }
 
-/// Brings an edge to its place, given it and the direction out of the curve (raw pixels); `None` where nobody can tell.
-pub(in crate::offline) type Finish<'f> = dyn Fn(&Refined, Pixel) -> Option<Refined> + 'f;
+/// Refines an edge, given the edge and the direction out of the curve (raw pixels); `None` where it cannot be located.
+pub(in crate::offline) type RefineEdge<'f> = dyn Fn(&Refined, Pixel) -> Option<Refined> + 'f;
 
-/// Where a curve carries edges.
+/// The edges along a curve.
 #[derive(Clone, Debug, Default)]
 pub(in crate::offline) struct Support {
-    /// Places that lie in the image.
+    /// Number of points inside the image.
     pub(in crate::offline) seen: usize,
-    /// Edge found at each place, if any.
+    /// Edge found at each point, if any.
     pub(in crate::offline) hits: Vec<Option<u32>>,
 }
 
-/// Places along a closed polygon of ideal pixels at about one `step`; stretches between flagged-out corners are left out.
-pub(in crate::offline) fn places(curve: &[Option<Pixel>], step: f64, inside: Pixel) -> Vec<Place> {
-    let n = curve.len();
-    let get = |k: usize| curve.get(k % n.max(1)).copied().flatten();
+/// Points along a closed polygon of ideal pixels, spaced by about one `step`. The neighbourhood of missing corners is
+/// left out.
+pub(in crate::offline) fn curve_points(polygon: &[Option<Pixel>], step: f64, inside: Pixel) -> Vec<CurvePoint> {
+    let n = polygon.len();
+    let get = |k: usize| polygon.get(k % n.max(1)).copied().flatten();
     let mut out = Vec::new();
     let mut since = f64::INFINITY;
     for k in 0..n {
@@ -58,17 +61,22 @@ pub(in crate::offline) fn places(curve: &[Option<Pixel>], step: f64, inside: Pix
         let towards = (p + o) * 0.5 - q;
         let sign = if towards.dot(&normal) < 0.0 { 1.0 } else { -1.0 };
         let radius = if area.abs() > 1e-12 { sign * sides / (4.0 * area.abs()) } else { f64::INFINITY };
-        out.push(Place { at: q, normal, radius });
+        out.push(CurvePoint { at: q, normal, radius });
         since = 0.0;
     }
     out
 }
 
 impl ViewEdges<'_> {
-    /// The edges next to places of a curve, whichever side is brighter; `bright_inside` asks for one.
-    pub(in crate::offline) fn support(&self, places: &[Place], tolerance: f64, bright_inside: Option<bool>) -> Support {
+    /// The edges next to points of a curve. `bright_inside` selects the brighter side; `None` accepts either.
+    pub(in crate::offline) fn support(
+        &self,
+        curve: &[CurvePoint],
+        tolerance: f64,
+        bright_inside: Option<bool>,
+    ) -> Support {
         let mut out = Support::default();
-        for p in places {
+        for p in curve {
             let raw = self.lens.raw(p.at);
             if !self.image.contains(raw, 6.0) {
                 continue;
@@ -90,27 +98,29 @@ impl ViewEdges<'_> {
         out
     }
 
-    /// The contour along a curve: its edges within a tolerance, brought to their place by `finish` if there is one. Its ellipse is only the nearest one.
+    /// The contour along a curve: its edges within a tolerance, refined by `finish` if given. Its ellipse is only the
+    /// best approximation. `None` when fewer than 12 edges or too little of the curve is found.
     pub(in crate::offline) fn follow(
         &self,
-        places: &[Place],
+        curve: &[CurvePoint],
         tolerance: f64,
-        finish: Option<&Finish<'_>>,
+        finish: Option<&RefineEdge<'_>>,
     ) -> Option<Contour> {
-        let any = self.support(places, tolerance, None);
-        let bright =
-            |k: u32, p: &Place| self.arcs.ideal.get(k as usize).is_some_and(|i| i.towards_bright.dot(&p.normal) < 0.0);
-        let seen: Vec<&Place> = places.iter().filter(|p| self.image.contains(self.lens.raw(p.at), 6.0)).collect();
+        let any = self.support(curve, tolerance, None);
+        let bright = |k: u32, p: &CurvePoint| {
+            self.arcs.ideal.get(k as usize).is_some_and(|i| i.towards_bright.dot(&p.normal) < 0.0)
+        };
+        let seen: Vec<&CurvePoint> = curve.iter().filter(|p| self.image.contains(self.lens.raw(p.at), 6.0)).collect();
         let (mut inside, mut outside) = (0usize, 0usize);
         for (h, p) in any.hits.iter().zip(&seen) {
             if let Some(k) = h {
                 *(if bright(*k, p) { &mut inside } else { &mut outside }) += 1;
             }
         }
-        // One side is the brighter nearly everywhere, unless the background changes behind a bar.
+        // One side is brighter nearly everywhere, unless the background behind a bar changes.
         let bright_inside = inside > outside;
         let mixed = inside.min(outside) * 4 > inside.max(outside);
-        let support = self.support(places, tolerance, (!mixed).then_some(bright_inside));
+        let support = self.support(curve, tolerance, (!mixed).then_some(bright_inside));
         let mut points = Vec::new();
         let mut rejected = Vec::new();
         let mut used = std::collections::BTreeSet::new();
@@ -157,10 +167,10 @@ impl ViewEdges<'_> {
         let n = points.len() as f64;
         let rms_px = (points.iter().map(|p| p.residual * p.residual).sum::<f64>() / n).sqrt();
         let coverage = (n / support.seen.max(1) as f64).min(1.0);
-        let good = coverage >= LEAST_COVERAGE;
+        let good = coverage >= MIN_COVERAGE;
         good.then_some(Contour { ellipse, bright_inside, points, rejected, coverage, rms_px })
     }
 }
 
-/// How far apart the places of a followed curve stand, pixels.
+/// Spacing of the points of a followed curve, pixels.
 pub(in crate::offline) const STEP_PX: f64 = INDEPENDENT_PX;

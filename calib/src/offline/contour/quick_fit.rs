@@ -1,14 +1,14 @@
-//! A direct ellipse fit from accumulated sums, for the thousands of trial ellipses that growing a contour takes.
+//! A direct ellipse fit from accumulated sums, for the thousands of trial ellipses of a growing contour.
 //!
-//! The method is that of Halir and Flusser; the sums of two arcs add, so that trying a pair of arcs costs one small eigenproblem.
-//! It finds contours; what is reported is fitted anew by maximum likelihood.
+//! The method is that of Halir and Flusser. The sums of two arcs add, so that trying a pair of arcs costs one small
+//! eigenproblem. The fit only finds contours; reported ellipses are fitted again by maximum likelihood.
 
-use crate::offline::rim::model::Ellipse2;
+use crate::offline::types::Ellipse2;
 use graspd_rt::geom::Pixel;
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 use std::cell::OnceCell;
 
-/// Sums of products of `(x^2, xy, y^2, x, y, 1)` over points, about a chosen origin and in a chosen unit.
+/// Sums of products of `(x^2, xy, y^2, x, y, 1)` over points, relative to an origin and in a chosen unit.
 #[derive(Clone, Copy, Debug)]
 pub(in crate::offline) struct Sums {
     origin: Pixel,
@@ -17,7 +17,8 @@ pub(in crate::offline) struct Sums {
 }
 
 impl Sums {
-    /// Empty sums; origin and unit near the place and size of what is fitted keep the numbers tame.
+    /// Empty sums. Origin and unit should be close to the position and size of the ellipse, for a good condition
+    /// number.
     pub(in crate::offline) fn new(origin: Pixel, unit: f64) -> Self {
         Self { origin, unit: unit.max(1e-9), m: Matrix6::zeros() }
     }
@@ -34,7 +35,7 @@ impl Sums {
         Self { m: self.m + other.m, ..*self }
     }
 
-    /// The best ellipse; `None` when the points determine none.
+    /// The least-squares ellipse; `None` when the points do not determine one.
     pub(in crate::offline) fn ellipse(&self) -> Option<Ellipse2> {
         let s1: Matrix3<f64> = self.m.fixed_view::<3, 3>(0, 0).into_owned();
         let s2: Matrix3<f64> = self.m.fixed_view::<3, 3>(0, 3).into_owned();
@@ -88,7 +89,7 @@ fn from_coefficients(a: f64, b: f64, c: f64, d: f64, e: f64, f: f64) -> Option<E
     ok.then(|| Ellipse2 { centre, a: big, b: small, theta: theta.rem_euclid(std::f64::consts::PI) })
 }
 
-/// An ellipse with its sines at hand, for walking along it and measuring from it.
+/// An ellipse with the sine and cosine of its direction, for walking along it and measuring distances from it.
 #[derive(Clone, Copy, Debug)]
 pub(in crate::offline) struct Walk {
     e: Ellipse2,
@@ -142,17 +143,18 @@ impl Walk {
         std::f64::consts::PI * (3.0 * (a + b) - ((3.0 * a + b) * (a + 3.0 * b)).sqrt())
     }
 
-    /// Parameters at equal arc lengths of about `step` pixels.
+    /// Parameters at equal arc lengths of about `step` pixels, at most `most` of them.
     pub(in crate::offline) fn parameters(&self, step: f64, most: usize) -> Vec<f64> {
         let n = self.count(step, most);
         self.evenly(n, &Turn::new(n)).into_iter().map(|p| p.t).collect()
     }
 
-    /// Points and outward unit normals at equal arc lengths of about `step` pixels, as many as `turns` are for at most.
-    pub(in crate::offline) fn places(&self, step: f64, turns: &Turns) -> Vec<(Pixel, Pixel)> {
+    /// Points and outward unit normals at equal arc lengths of about `step` pixels, at most as many as `turns`
+    /// provides.
+    pub(in crate::offline) fn points(&self, step: f64, turns: &Turns) -> Vec<(Pixel, Pixel)> {
         let n = self.count(step, turns.most());
-        let places = turns.with(n, |turn| self.evenly(n, turn));
-        places.into_iter().map(|p| self.at_sin_cos(p.sin, p.cos)).collect()
+        let parameters = turns.with(n, |turn| self.evenly(n, turn));
+        parameters.into_iter().map(|p| self.at_sin_cos(p.sin, p.cos)).collect()
     }
 
     fn count(&self, step: f64, most: usize) -> usize {
@@ -188,12 +190,12 @@ struct Parameter {
     cos: f64,
 }
 
-/// The steps of walks once round, by their number of places, each made when it is first asked for.
+/// Tables of one full turn, by number of points, each computed on first use.
 #[derive(Clone, Debug)]
 pub(in crate::offline) struct Turns(Vec<OnceCell<Turn>>);
 
 impl Turns {
-    /// For walks of up to `most` places.
+    /// Tables for up to `most` points.
     pub(in crate::offline) fn new(most: usize) -> Self {
         Self(vec![OnceCell::new(); most + 1])
     }
@@ -202,7 +204,7 @@ impl Turns {
         self.0.len().saturating_sub(1)
     }
 
-    /// Gives points and outward unit normals of a walk to a function: `4 n` at equal parameters.
+    /// Calls `take` with points and outward unit normals of a full turn: `4 n` at equal parameters.
     pub(in crate::offline) fn round(&self, walk: Walk, n: usize, mut take: impl FnMut(Pixel, Pixel)) {
         self.with(n, |turn| {
             for p in &turn.fine {
@@ -220,7 +222,7 @@ impl Turns {
     }
 }
 
-/// The steps of a walk once round with a number of places.
+/// Fine parameters of one full turn for a number of points.
 #[derive(Clone, Debug)]
 struct Turn {
     fine: Vec<Parameter>,
@@ -243,7 +245,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn exact_points_give_the_ellipse_back() {
+    fn exact_points_reproduce_the_ellipse() {
         for k in 0..40 {
             let th = 0.08 * f64::from(k);
             let e = Ellipse2 {
@@ -267,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn walking_measuring_and_the_length_agree() {
+    fn points_distances_and_arc_length_agree() {
         let e = Ellipse2 { centre: Pixel::new(10.0, 20.0), a: 50.0, b: 20.0, theta: 0.7 };
         let w = Walk::new(&e);
         for t in w.parameters(2.0, 1000) {
@@ -283,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_gives_nothing_sound() {
+    fn a_line_gives_no_plausible_ellipse() {
         let mut s = Sums::new(Pixel::zeros(), 100.0);
         for i in 0..30 {
             s.add(Pixel::new(f64::from(i), 2.0 * f64::from(i)), 1.0);

@@ -1,25 +1,28 @@
-//! From what the operator selected to the contours that may be meant.
+//! From the operator's selection to candidate contours.
 //!
-//! A click near a painted line means one of its two edges, and nobody knows which; the other view decides. So a selection gives a few contours, the
-//! likeliest first, each through edges next to the click, and the pair that is the image of one rim is taken (see [`crate::offline::decide::pairing`]).
+//! A click near a painted line means one of its two edges, and the click alone does not say which; the other view
+//! decides. A selection therefore gives several candidate contours, most likely first, each through edges next to the
+//! click. The pair that is the image of one rim is chosen later (see [`crate::offline::decide::pairing`]).
 
+use crate::offline::contour::grow::Trial;
+use crate::offline::contour::one_ellipse::{Contour, MIN_COVERAGE, alike};
 use crate::offline::contour::quick_fit::Walk;
-use crate::offline::contour::{Contour, LEAST_COVERAGE, Trial, ViewEdges, alike};
+use crate::offline::contour::view_edges::ViewEdges;
 use graspd_rt::geom::{Pixel, View};
 
-/// What was selected in one view, raw pixels.
+/// The operator's selection in one view, raw pixels.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Selection {
     /// A click near the contour.
     Click(Pixel),
     /// Several points on the contour.
     Points(Vec<Pixel>),
-    /// Two opposite corners of a box round the contour.
+    /// Two opposite corners of a box around the contour.
     Box(Pixel, Pixel),
 }
 
 impl Selection {
-    /// Its kind, as the plan file names it.
+    /// The kind as written to the plan file.
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Click(_) => "click",
@@ -28,7 +31,7 @@ impl Selection {
         }
     }
 
-    /// Its pixels.
+    /// The selected pixels.
     pub fn pixels(&self) -> Vec<Pixel> {
         match self {
             Self::Click(p) => vec![*p],
@@ -38,11 +41,11 @@ impl Selection {
     }
 }
 
-/// Why a selection leads to no contour.
+/// Why a selection gives no contour.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SelectError {
     /// A pixel outside the image.
-    #[error("the {} selection ({:.1}, {:.1}) lies outside the {width}x{height} image: click inside it", name(.view), at.x, at.y)]
+    #[error("the {} selection ({:.1}, {:.1}) is outside the {width}x{height} image: click inside it", name(.view), at.x, at.y)]
     Outside {
         /// The view.
         view: View,
@@ -54,19 +57,19 @@ pub enum SelectError {
         height: usize,
     },
     /// No edge near the click.
-    #[error("there is no edge within {radius:.0} px of the {} click ({:.1}, {:.1}){}: click closer to the contour", name(.view), at.x, at.y, nearest_text(.nearest))]
+    #[error("no edge within {radius:.0} px of the {} click ({:.1}, {:.1}){}: click closer to the contour", name(.view), at.x, at.y, nearest_text(.nearest))]
     NoEdge {
         /// The view.
         view: View,
         /// The click.
         at: Pixel,
-        /// How far was looked.
+        /// Radius of the search, pixels.
         radius: f64,
-        /// The nearest edge that belongs to a line of edges, if any.
+        /// The nearest edge that is part of an arc, if any.
         nearest: Option<Pixel>,
     },
     /// Edges, but no ellipse.
-    #[error("the edges near the {} selection ({:.1}, {:.1}) belong to no ellipse (the best one has edges on {percent:.0} % of its outline; at least {least:.0} % are needed, on one smooth line): click the rim itself, or several points on it", name(.view), at.x, at.y)]
+    #[error("the edges near the {} selection ({:.1}, {:.1}) do not form an ellipse: the best one has edges on {percent:.0} % of its outline, at least {least:.0} % on one smooth line are required: click the rim itself, or several points on it", name(.view), at.x, at.y)]
     NoEllipse {
         /// The view.
         view: View,
@@ -74,10 +77,10 @@ pub enum SelectError {
         at: Pixel,
         /// Coverage of the best ellipse, percent.
         percent: f64,
-        /// What is needed, percent.
+        /// The required coverage, percent.
         least: f64,
     },
-    /// A box that holds nothing, or too few points.
+    /// A box without edges, or too few points.
     #[error("the {} selection is empty: {fix}", name(.view))]
     Empty {
         /// The view.
@@ -98,28 +101,33 @@ fn nearest_text(p: &Option<Pixel>) -> String {
     p.map_or(String::new(), |p| format!(", the nearest is at ({:.0}, {:.0})", p.x, p.y))
 }
 
-/// A contour that may be meant, and how far from meant it is.
+/// A candidate contour with its cost.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Candidate {
     /// The contour.
     pub contour: Contour,
-    /// Distance from the selection in pixels, plus what is missing of the outline and how it scatters; the smallest is the likeliest.
+    /// Distance from the selection in pixels, plus penalties for missing outline and for scatter. The smallest cost is
+    /// the most likely.
     pub cost: f64,
 }
 
-/// How far from an edge a click may be: an operator's hand on a large image.
+/// Largest distance between a click and an edge, pixels: the accuracy of a hand on a large image.
 pub fn snap_radius(width: usize) -> f64 {
     (0.01 * width as f64).clamp(8.0, 20.0)
 }
 
-/// Cost from which a contour through the edges at the click is doubtful enough to look for one that passes it in a gap.
-const DOUBTFUL: f64 = 6.0;
-/// What it costs a contour to have no edge at the click, pixels.
-const IN_A_GAP: f64 = 3.0;
-/// Arcs tried for such a contour.
-const GAP_SEEDS: usize = 6;
+/// Cost above which a contour through the edges at the click is doubtful, so that contours with a gap there are tried
+/// too, pixels.
+const MAX_CERTAIN_COST_PX: f64 = 6.0;
+/// Penalty of a contour without an edge at the click, pixels.
+const GAP_COST_PX: f64 = 3.0;
+/// Largest number of arcs tried for such a contour.
+const MAX_GAP_SEEDS: usize = 6;
 
-/// Contours that a selection may mean, likeliest first, at most `keep`.
+/// Candidate contours of a selection, most likely first, at most `keep`.
+///
+/// # Errors
+/// [`SelectError`] when a pixel is outside the image, or no edge or no ellipse is near the selection.
 pub fn contours(
     view: View,
     edges: &ViewEdges<'_>,
@@ -139,8 +147,9 @@ pub fn contours(
     }
 }
 
-/// What speaks against a contour being a rim, in pixels of click distance: a gappy outline, and edges that scatter about the ellipse.
-fn unlikely(c: &Contour) -> f64 {
+/// Penalty against a contour being a rim, in pixels of click distance: a gappy outline, and edges that scatter about
+/// the ellipse.
+fn penalty(c: &Contour) -> f64 {
     let missing = 1.0 - c.coverage;
     8.0 * missing * missing + 5.0 * c.rms_px.min(2.0)
 }
@@ -181,22 +190,22 @@ fn click(view: View, edges: &ViewEdges<'_>, at: Pixel, keep: usize) -> Result<Ve
         for t in edges.trials(*seed, 3) {
             best = best.max(t.coverage);
             if let Some(contour) = edges.contour(&t) {
-                let cost = contour.distance(at) + unlikely(&contour);
+                let cost = contour.distance(at) + penalty(&contour);
                 push(&mut out, Candidate { contour, cost });
             }
         }
     }
-    if out.iter().all(|c| c.cost > DOUBTFUL) {
+    if out.iter().all(|c| c.cost > MAX_CERTAIN_COST_PX) {
         through(edges, at, radius, &mut out);
     }
     finish(view, at, best, out, keep)
 }
 
-/// Adds contours that pass a click in a gap.
+/// Adds contours that have a gap at the click.
 fn through(edges: &ViewEdges<'_>, at: Pixel, radius: f64, out: &mut Vec<Candidate>) {
     let Some(ideal) = edges.lens.ideal(at) else { return };
-    for seed in edges.passing(ideal, radius, GAP_SEEDS) {
-        // Most arcs of a contour lead to the same one.
+    for seed in edges.passing(ideal, radius, MAX_GAP_SEEDS) {
+        // Most arcs of a contour lead to the same ellipse.
         let known = |c: &Candidate| {
             edges.arcs.ideal.get(seed).is_some_and(|e| Walk::new(&c.contour.ellipse).measure(e.at).0.abs() < 1.0)
         };
@@ -209,7 +218,7 @@ fn through(edges: &ViewEdges<'_>, at: Pixel, radius: f64, out: &mut Vec<Candidat
                 continue;
             }
             if let Some(contour) = edges.contour(&t) {
-                let cost = off + unlikely(&contour) + IN_A_GAP;
+                let cost = off + penalty(&contour) + GAP_COST_PX;
                 push(out, Candidate { contour, cost });
             }
         }
@@ -228,7 +237,8 @@ fn points(view: View, edges: &ViewEdges<'_>, at: &[Pixel], keep: usize) -> Resul
             any = true;
             for t in edges.trials(*seed, 2) {
                 best = best.max(t.coverage);
-                // Most of the points have to lie on it: one slip of the hand is forgiven, a different contour is not.
+                // Three quarters of the points have to lie on the contour: one misplaced point is tolerated, a
+                // different contour is not.
                 let far = |t: &Trial| {
                     let w = Walk::new(&t.ellipse);
                     let mut d: Vec<f64> = at
@@ -243,7 +253,7 @@ fn points(view: View, edges: &ViewEdges<'_>, at: &[Pixel], keep: usize) -> Resul
                     continue;
                 }
                 if let Some(contour) = edges.contour(&t) {
-                    let cost = d + unlikely(&contour);
+                    let cost = d + penalty(&contour);
                     push(&mut out, Candidate { contour, cost });
                 }
             }
@@ -260,7 +270,7 @@ fn boxed(view: View, edges: &ViewEdges<'_>, a: Pixel, b: Pixel, keep: usize) -> 
     let (lo, hi) = (a.inf(&b), a.sup(&b));
     let middle = (lo + hi) * 0.5;
     if (hi - lo).min() < 8.0 {
-        return Err(SelectError::Empty { view, fix: "draw a box of at least 8 px round the contour" });
+        return Err(SelectError::Empty { view, fix: "draw a box of at least 8 px around the contour" });
     }
     let inside = |p: Pixel| p.x >= lo.x - 3.0 && p.y >= lo.y - 3.0 && p.x <= hi.x + 3.0 && p.y <= hi.y + 3.0;
     let mut arcs: Vec<_> = edges
@@ -275,7 +285,7 @@ fn boxed(view: View, edges: &ViewEdges<'_>, a: Pixel, b: Pixel, keep: usize) -> 
     for arc in arcs.iter().take(40) {
         let Some(seed) = arc.edges.get(arc.edges.len() / 2) else { continue };
         if let Some(p) = edges.map.edges().get(*seed as usize).and_then(|e| edges.lens.ideal(e.at)) {
-            // Most seeds lie on a contour that is already known.
+            // Most seeds lie on a contour that is already found.
             if out.iter().any(|c| Walk::new(&c.contour.ellipse).measure(p).0.abs() < 1.0) {
                 continue;
             }
@@ -293,14 +303,14 @@ fn boxed(view: View, edges: &ViewEdges<'_>, a: Pixel, b: Pixel, keep: usize) -> 
             if !(inside(l) && inside(h)) {
                 continue;
             }
-            // The largest contour that fills the box is meant.
+            // The contour that fills the box best is the most likely.
             let gap = (l - lo).abs().max().max((hi - h).abs().max());
-            let cost = gap + unlikely(&contour);
+            let cost = gap + penalty(&contour);
             push(&mut out, Candidate { contour, cost });
         }
     }
     if arcs.is_empty() {
-        return Err(SelectError::Empty { view, fix: "there are no edges in the box; draw it round the contour" });
+        return Err(SelectError::Empty { view, fix: "there are no edges in the box; draw it around the contour" });
     }
     finish(view, middle, best, out, keep)
 }
@@ -324,7 +334,7 @@ fn finish(
     keep: usize,
 ) -> Result<Vec<Candidate>, SelectError> {
     if out.is_empty() {
-        return Err(SelectError::NoEllipse { view, at, percent: 100.0 * best, least: 100.0 * LEAST_COVERAGE });
+        return Err(SelectError::NoEllipse { view, at, percent: 100.0 * best, least: 100.0 * MIN_COVERAGE });
     }
     out.sort_by(|a, b| a.cost.total_cmp(&b.cost));
     out.truncate(keep);

@@ -1,4 +1,4 @@
-//! A match to a fraction of a pixel: the patch of one image is shifted over the other until their grey values agree
+//! Sub-pixel refinement of a match: the patch of one image is shifted over the other until their grey values agree
 //! best.
 
 use crate::offline::edges::grey_image::GreyImage;
@@ -7,20 +7,21 @@ use nalgebra::{Matrix4, Vector4};
 
 /// Half the side of the patch, pixels.
 const HALF: i32 = 6;
-/// Farthest that the coarse match may be off, pixels: one pixel of the halved image and a bit.
-const FARTHEST_PX: f64 = 3.0;
-/// Steps at most; the last one has to be shorter than [`SETTLED_PX`].
-const STEPS: usize = 12;
-const SETTLED_PX: f64 = 0.01;
-/// Part of the patch's variance that may remain unexplained: more, and the two are seen from too different sides.
-const MOST_LEFT: f64 = 0.05;
-/// Standard deviation of the match above which it says nothing that the prior does not, pixels.
-const MOST_SIGMA_PX: f64 = 0.5;
+/// Largest error of the coarse match, pixels: one pixel of the halved image, with a margin.
+const MAX_SHIFT_PX: f64 = 3.0;
+/// Largest number of iterations.
+const MAX_STEPS: usize = 12;
+/// Step below which the iteration has converged, pixels.
+const CONVERGED_PX: f64 = 0.01;
+/// Largest unexplained fraction of the patch's variance: beyond it the views differ too much.
+const MAX_UNEXPLAINED: f64 = 0.05;
+/// Largest standard deviation of a match, pixels: beyond it the match adds nothing to the prior.
+const MAX_SIGMA_PX: f64 = 0.5;
 
 /// A refined match.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Found {
-    /// Place in the second image, raw pixels.
+    /// Position in the second image, raw pixels.
     pub(super) at: Pixel,
     /// Its covariance, pixels squared.
     cov: nalgebra::Matrix2<f64>,
@@ -33,7 +34,7 @@ impl Found {
     }
 }
 
-/// Refines a match of the place `from` of the first image with `start` in the second, over shift, contrast and
+/// Refines a match of the point `from` of the first image, starting at `start` in the second, over shift, contrast and
 /// brightness.
 ///
 /// `None` where the patches do not agree or do not determine the shift.
@@ -41,17 +42,17 @@ pub(super) fn refine(images: [&GreyImage; 2], from: Pixel, start: Pixel, noise: 
     let [a, b] = images;
     let margin = f64::from(HALF) + 2.0;
     let mut at = start;
-    let wanted = patch(a, from)?;
-    let mean = wanted.iter().sum::<f64>() / wanted.len() as f64;
-    let variance = wanted.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / wanted.len() as f64;
+    let template = patch(a, from)?;
+    let mean = template.iter().sum::<f64>() / template.len() as f64;
+    let variance = template.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / template.len() as f64;
     let mut last = None;
-    for _ in 0..STEPS {
-        if !b.contains(at, margin) || (at - start).norm() > FARTHEST_PX {
+    for _ in 0..MAX_STEPS {
+        if !b.contains(at, margin) || (at - start).norm() > MAX_SHIFT_PX {
             return None;
         }
         let (mut normal, mut right, mut square) = (Matrix4::zeros(), Vector4::zeros(), 0.0);
-        let mut next = wanted.iter();
-        // Grey of the first image as contrast times that of the second plus brightness, with the second shifted.
+        let mut next = template.iter();
+        // The grey value of the first image is contrast times that of the shifted second image plus brightness.
         for y in -HALF..=HALF {
             for x in -HALF..=HALF {
                 let (v, dx, dy) = sample(b, at.x + f64::from(x), at.y + f64::from(y))?;
@@ -67,25 +68,25 @@ pub(super) fn refine(images: [&GreyImage; 2], from: Pixel, start: Pixel, noise: 
         if !(s.z > 0.2) {
             return None;
         }
-        let left = (square - s.dot(&right)).max(0.0) / wanted.len() as f64;
-        // The derivative columns carry the contrast.
+        let left = (square - s.dot(&right)).max(0.0) / template.len() as f64;
+        // The coefficients of the derivatives are the shift times the contrast.
         let step = Pixel::new(s.x / s.z, s.y / s.z);
-        if !(step.norm() < FARTHEST_PX) {
+        if !(step.norm() < MAX_SHIFT_PX) {
             return None;
         }
         at += step;
         last = Some((left, solved.inverse().fixed_view::<2, 2>(0, 0) / (s.z * s.z)));
-        if step.norm() < SETTLED_PX {
+        if step.norm() < CONVERGED_PX {
             break;
         }
     }
     let (left, inverse) = last?;
-    if left > MOST_LEFT * variance + 2.0 * noise * noise {
+    if left > MAX_UNEXPLAINED * variance + 2.0 * noise * noise {
         return None;
     }
-    // Neighbouring residuals are one and the same misfit rather than independent noise.
+    // Neighbouring residuals share one misfit rather than independent noise: they count as one row of the patch.
     let found = Found { at, cov: inverse * (left.max(noise * noise) * f64::from(2 * HALF + 1)) };
-    (found.cov.trace().sqrt() < MOST_SIGMA_PX && (at - start).norm() <= FARTHEST_PX).then_some(found)
+    (found.cov.trace().sqrt() < MAX_SIGMA_PX && (at - start).norm() <= MAX_SHIFT_PX).then_some(found)
 }
 
 fn patch(image: &GreyImage, at: Pixel) -> Option<Vec<f64>> {

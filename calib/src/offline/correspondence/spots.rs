@@ -1,35 +1,32 @@
-//! Whether two images were given in the wrong order, from everything that is in them.
+//! Matches of distinctive patches (spots) between the images, and whether the images were given in the wrong order.
 //!
-//! A rim near the middle of a symmetrical rig can be reconstructed from its two contours either way round: the
-//! contours alone cannot tell. The rest of the images can. Distinct spots of one image are looked for in the
-//! other along the lines, and in front of both cameras, where the rig says that they have to be; in the right order
-//! they are found, in the wrong one their lines run elsewhere, or their places lie behind the cameras.
+//! A rim near the middle of a symmetrical rig can be reconstructed from its two contours in either order of the
+//! images: the contours alone cannot decide. The rest of the images can. Distinctive spots of one image are searched
+//! in the other along their epipolar lines and in front of both cameras. In the right order they are found; in the
+//! wrong one their lines run elsewhere, or their points lie behind the cameras.
 
+use crate::offline::correspondence::epipolar::Match;
+use crate::offline::correspondence::patches::{Small, Totals};
 use crate::offline::correspondence::refine;
-use crate::offline::correspondence::rig_error::Match;
 use crate::offline::edges::grey_image::GreyImage;
 use crate::offline::edges::lens::Lens;
-use crate::offline::rim::cone::camera_centre;
-use crate::offline::rim::model::Projection;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::camera_centre;
 use graspd_rt::geom::Pixel;
 use nalgebra::Vector3;
 
-/// Cells of the left image that give one spot each, across and down.
-const CELLS: [usize; 2] = [20, 16];
-/// Half the side of a patch, pixels of the halved image.
-const HALF: i32 = 6;
-/// A spot is found where the correlation is at least this.
-const FOUND: f64 = 0.75;
-/// A spot speaks for an order when it correlates better by this.
-const BETTER: f64 = 0.12;
-/// Least number of spots that have to speak for the other order.
-const LEAST: usize = 6;
-/// Nearest distance looked at, in baselines.
-const NEAREST: f64 = 0.8;
-/// Places tried along a line at most.
-const MOST_PLACES: usize = 420;
+/// Smallest correlation of a match.
+const MIN_CORRELATION: f64 = 0.75;
+/// Smallest difference of the correlations for a vote on the order.
+const MIN_ADVANTAGE: f64 = 0.12;
+/// Smallest number of votes for a decision on the order.
+const MIN_VOTES: usize = 6;
+/// Nearest distance that is searched, in baselines.
+const MIN_DISTANCE: f64 = 0.8;
+/// Largest number of positions along a line.
+const MAX_POSITIONS: usize = 420;
 
-/// How many spots speak for each order.
+/// Votes of the spots for each order of the images.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Votes {
     /// For the order as given.
@@ -41,208 +38,26 @@ pub struct Votes {
 impl Votes {
     /// Whether the images were given in the wrong order, beyond chance.
     pub fn are_exchanged(&self) -> bool {
-        self.exchanged >= LEAST && self.exchanged > 3 * self.as_given
+        self.exchanged >= MIN_VOTES && self.exchanged > 3 * self.as_given
     }
 
-    /// Whether they were given in the right order, beyond chance.
+    /// Whether the images were given in the right order, beyond chance.
     pub fn are_as_given(&self) -> bool {
-        self.as_given >= LEAST && self.as_given > 3 * self.exchanged
+        self.as_given >= MIN_VOTES && self.as_given > 3 * self.exchanged
     }
 }
 
-/// Side of a patch.
-const SIDE: usize = 2 * HALF as usize + 1;
-/// Columns of a patch that are worked on: the rest of the wanted patch's rows is zero, so that what lies beside the
-/// other one does not count.
-const LANES: usize = 16;
-
-/// An image at half its size: quick to search, and blind to the noise. Its values are sums of four grey values, so
-/// that all sums are exact.
-struct Small {
-    w: usize,
-    h: usize,
-    /// Values from one row to the next: rows have room for the last patch's lanes.
-    stride: usize,
-    sums: Vec<i16>,
-}
-
-impl Small {
-    fn of(p: &GreyImage) -> Self {
-        let (w, h) = (p.width() / 2, p.height() / 2);
-        let stride = w + LANES - SIDE;
-        let mut sums = Vec::with_capacity(stride * h);
-        for y in 0..h {
-            let (a, b) = (p.row(2 * y), p.row(2 * y + 1));
-            let pairs = a.chunks_exact(2).zip(b.chunks_exact(2)).take(w);
-            sums.extend(pairs.map(|(a, b)| a.iter().chain(b).map(|v| i16::from(*v)).sum::<i16>()));
-            sums.resize(stride * (y + 1), 0);
-        }
-        Self { w, h, stride, sums }
-    }
-
-    /// Where the patch round a pixel begins; `None` at the border.
-    fn first(&self, x: i32, y: i32) -> Option<usize> {
-        let (x0, y0) = (usize::try_from(x - HALF).ok()?, usize::try_from(y - HALF).ok()?);
-        (x0 + SIDE <= self.w && y0 + SIDE <= self.h).then_some(y0 * self.stride + x0)
-    }
-
-    /// The rows of a patch, `LANES` wide.
-    fn rows(&self, first: usize) -> impl Iterator<Item = &[i16; LANES]> {
-        (0..SIDE).filter_map(move |k| self.sums.get(first + k * self.stride..)?.first_chunk())
-    }
-
-    /// The patch round a pixel; `None` at the border and where nothing is.
-    fn patch(&self, x: i32, y: i32, least: f32) -> Option<Patch> {
-        let mut rows = [[0i16; LANES]; SIDE];
-        for (row, source) in rows.iter_mut().zip(self.rows(self.first(x, y)?)) {
-            row.iter_mut().zip(source).take(SIDE).for_each(|(v, s)| *v = *s);
-        }
-        let sum = rows.iter().flatten().map(|v| i32::from(*v)).sum();
-        let square = rows.iter().flatten().map(|v| i32::from(*v) * i32::from(*v)).sum();
-        let size = size(sum, square, least)?;
-        Some(Patch { rows, sum, size })
-    }
-
-    /// Correlation of a patch with that round a pixel; `None` at the border and where nothing is.
-    fn correlation(&self, wanted: &Patch, totals: &Totals, x: i32, y: i32, least: f32) -> Option<f32> {
-        let first = self.first(x, y)?;
-        let (sum, square) = totals.of(first)?;
-        let size = size(sum, square, least)?;
-        let mut products = [0i32; LANES / 2];
-        for (row, source) in wanted.rows.iter().zip(self.rows(first)) {
-            for ((p, a), b) in products.iter_mut().zip(row.as_chunks::<2>().0).zip(source.as_chunks::<2>().0) {
-                *p += i32::from(a[0]) * i32::from(b[0]) + i32::from(a[1]) * i32::from(b[1]);
-            }
-        }
-        let product: i32 = products.iter().sum();
-        let joint = f64::from(product) - f64::from(wanted.sum) * f64::from(sum) / COUNT;
-        Some((joint / (wanted.size * size)) as f32)
-    }
-
-    /// Products of the gradient (`xx`, `xy`, `yy`) over the column of each pixel of a row: every other of nine rows.
-    /// Nothing at the border.
-    fn columns(&self, y: usize, out: &mut [Vec<f32>; 3]) {
-        let [xx, xy, yy] = out;
-        for o in [&mut *xx, &mut *xy, &mut *yy] {
-            o.clear();
-            o.resize(self.w, 0.0);
-        }
-        let row = |y: usize| self.sums.get(y * self.stride..y * self.stride + self.w).unwrap_or(&[]);
-        for v in (y.saturating_sub(4)..=y + 4).step_by(2) {
-            let (above, here, below) = (row(v.saturating_sub(1)), row(v), row(v + 1));
-            let sides = here.iter().zip(here.iter().skip(2));
-            let ends = above.iter().skip(1).zip(below.iter().skip(1));
-            let sums = xx.iter_mut().skip(1).zip(xy.iter_mut().skip(1)).zip(yy.iter_mut().skip(1));
-            for ((((xx, xy), yy), (l, r)), (a, b)) in sums.zip(sides).zip(ends) {
-                let (dx, dy) = (f32::from(r - l), f32::from(b - a));
-                *xx += dx * dx;
-                *xy += dx * dy;
-                *yy += dy * dy;
-            }
-        }
-    }
-
-    /// Smaller eigenvalue of the structure tensor: large where a patch has detail in both directions.
-    fn detail(columns: &[Vec<f32>; 3], x: usize) -> f32 {
-        let [xx, xy, yy] = columns.each_ref().map(|c| {
-            c.get(x.saturating_sub(4)..)
-                .and_then(|c| c.first_chunk::<9>())
-                .map_or(0.0, |c| c[0] + c[2] + c[4] + c[6] + c[8])
-        });
-        0.5 * (xx + yy - ((xx - yy) * (xx - yy) + 4.0 * xy * xy).sqrt())
-    }
-
-    /// The spot with most detail in each cell.
-    fn spots(&self) -> Vec<(usize, usize)> {
-        let margin = HALF as usize + 6;
-        let (cw, ch) = ((self.w.saturating_sub(2 * margin)) / CELLS[0], (self.h.saturating_sub(2 * margin)) / CELLS[1]);
-        let mut out = Vec::new();
-        let mut columns = [const { Vec::new() }; 3];
-        for y0 in (0..CELLS[1]).map(|k| margin + k * ch) {
-            let mut best = [(0.0f32, None); CELLS[0]];
-            for y in (y0..y0 + ch).step_by(3) {
-                self.columns(y, &mut columns);
-                for (k, best) in best.iter_mut().enumerate() {
-                    let x0 = margin + k * cw;
-                    for x in (x0..x0 + cw).step_by(3) {
-                        let d = Self::detail(&columns, x);
-                        if d > best.0 {
-                            *best = (d, Some((x, y)));
-                        }
-                    }
-                }
-            }
-            out.extend(best.iter().filter_map(|b| b.1));
-        }
-        out
-    }
-}
-
-/// Number of values in a patch.
-const COUNT: f64 = (SIDE * SIDE) as f64;
-
-/// A patch that is looked for.
-struct Patch {
-    rows: [[i16; LANES]; SIDE],
-    sum: i32,
-    size: f64,
-}
-
-/// Root of the summed squares about the mean; `None` where it is less than `least` grey levels a pixel.
-fn size(sum: i32, square: i32, least: f32) -> Option<f64> {
-    let size = (f64::from(square) - f64::from(sum) * f64::from(sum) / COUNT).max(0.0).sqrt();
-    (size > 0.0 && size >= 4.0 * f64::from(least) * COUNT.sqrt()).then_some(size)
-}
-
-/// Sums and sums of squares over every patch of an image.
-///
-/// The squares' running sums overflow; what wraps round drops out of the differences, and those of a patch fit.
-struct Totals {
-    stride: usize,
-    running: Vec<[u32; 2]>,
-}
-
-impl Totals {
-    fn of_image(p: &Small) -> Self {
-        let stride = p.stride + 1;
-        let mut running = vec![[0u32; 2]; stride];
-        running.reserve(stride * p.h);
-        for (y, row) in p.sums.chunks_exact(p.stride).enumerate() {
-            let mut along = [0u32; 2];
-            running.push(along);
-            for (x, v) in row.iter().enumerate() {
-                let v = u32::from(v.unsigned_abs());
-                let above = running.get(y * stride + x + 1).copied().unwrap_or_default();
-                along = [along[0].wrapping_add(v), along[1].wrapping_add(v * v)];
-                running.push([above[0].wrapping_add(along[0]), above[1].wrapping_add(along[1])]);
-            }
-        }
-        Self { stride, running }
-    }
-
-    /// Sum and sum of squares of the patch that begins at a place of the image.
-    fn of(&self, first: usize) -> Option<(i32, i32)> {
-        // The running sums have one column more than the image.
-        let at = first + first / (self.stride - 1);
-        let corner = |k: usize| self.running.get(at + k);
-        let below = SIDE * self.stride;
-        let (a, b, c, d) = (corner(0)?, corner(SIDE)?, corner(below)?, corner(below + SIDE)?);
-        let sum = |i: usize| d[i].wrapping_sub(b[i]).wrapping_sub(c[i]).wrapping_add(a[i]) as i32;
-        Some((sum(0), sum(1)))
-    }
-}
-
-/// What the spots of two images say: their votes on the order, and where those that were found in the order as given
-/// lie.
+/// Votes on the order of two images, and the matches in the order as given.
 #[derive(Clone, Debug, Default)]
 pub struct Spots {
     /// Votes on the order of the images.
     pub votes: Votes,
-    /// Places of one point in both images.
+    /// Matches in ideal pixels.
     pub matches: Vec<Match>,
 }
 
-/// Looks for the spots of the first image in the second, in both orders. `noise` is the images' noise in grey levels.
+/// Searches the spots of the first image in the second, in both orders. `noise` is the noise of the images in grey
+/// levels.
 pub fn spots(images: [&GreyImage; 2], lenses: [&Lens; 2], p: [&Projection; 2], noise: f64) -> Spots {
     let mut out = Spots::default();
     let small = images.map(Small::of);
@@ -250,19 +65,19 @@ pub fn spots(images: [&GreyImage; 2], lenses: [&Lens; 2], p: [&Projection; 2], n
     let least = (1.5 * noise).max(1.0) as f32;
     let totals = Totals::of_image(&small[1]);
     for (x, y) in small[0].spots() {
-        let Some(wanted) = small[0].patch(x as i32, y as i32, least) else { continue };
+        let Some(template) = small[0].patch(x as i32, y as i32, least) else { continue };
         let at = Pixel::new(2.0 * x as f64 + 0.5, 2.0 * y as f64 + 0.5);
-        // The first image is the left camera's as given, the right camera's if exchanged.
-        let look = |ray: &Ray<'_>| {
-            let correlation = |u: i32, v: i32| small[1].correlation(&wanted, &totals, u, v, 0.5 * least);
-            search(&ray.places(at), correlation)
+        // The first image is the left camera's as given, and the right camera's if exchanged.
+        let best = |ray: &Ray<'_>| {
+            let correlation = |u: i32, v: i32| small[1].correlation(&template, &totals, u, v, 0.5 * least);
+            search(&ray.positions(at), correlation)
         };
-        let [given, other] = [look(&a), look(&b)];
+        let [given, other] = [best(&a), best(&b)];
         let size = [given, other].map(|f| f.map_or(-1.0, |f| f64::from(f.0)));
-        if size[0].max(size[1]) >= FOUND && (size[0] - size[1]).abs() >= BETTER {
+        if size[0].max(size[1]) >= MIN_CORRELATION && (size[0] - size[1]).abs() >= MIN_ADVANTAGE {
             *(if size[0] > size[1] { &mut out.votes.as_given } else { &mut out.votes.exchanged }) += 1;
         }
-        let Some((_, u, v)) = given.filter(|_| size[0] >= FOUND) else { continue };
+        let Some((_, u, v)) = given.filter(|_| size[0] >= MIN_CORRELATION) else { continue };
         let start = Pixel::new(2.0 * f64::from(u) + 0.5, 2.0 * f64::from(v) + 0.5);
         out.matches.extend(refine::refine(images, at, start, noise).and_then(|found| {
             let ideal = [lenses[0].ideal(at)?, lenses[1].ideal(found.at)?];
@@ -273,18 +88,20 @@ pub fn spots(images: [&GreyImage; 2], lenses: [&Lens; 2], p: [&Projection; 2], n
     out
 }
 
-/// Places along the line from which the search climbs.
+/// Number of local maxima along the line from which the search climbs.
 const CLIMBS: usize = 3;
-/// Steps of a climb at most: the rig's error moves a place off its line by a few pixels of the halved image.
+/// Largest number of steps of a climb: the error of the rig moves a point off its line by a few pixels of the halved
+/// image.
 const CLIMB_STEPS: usize = 5;
 
-/// The best correlation near a line: from its highest places uphill, because the line is only as good as the rig.
-fn search(places: &[(i32, i32)], correlation: impl Fn(i32, i32) -> Option<f32>) -> Option<(f32, i32, i32)> {
-    let along: Vec<f32> = places.iter().map(|(u, v)| correlation(*u, *v).unwrap_or(-1.0)).collect();
+/// The best correlation near a line: hill climbing from its highest maxima, because the line is only as accurate as
+/// the rig.
+fn search(positions: &[(i32, i32)], correlation: impl Fn(i32, i32) -> Option<f32>) -> Option<(f32, i32, i32)> {
+    let along: Vec<f32> = positions.iter().map(|(u, v)| correlation(*u, *v).unwrap_or(-1.0)).collect();
     let value = |k: Option<usize>| k.and_then(|k| along.get(k)).copied().unwrap_or(-1.0);
     let mut peaks: Vec<(f32, (i32, i32))> = along
         .iter()
-        .zip(places)
+        .zip(positions)
         .enumerate()
         .filter(|(k, (c, _))| **c > -1.0 && **c >= value(k.checked_sub(1)) && **c > value(Some(k + 1)))
         .map(|(_, (c, p))| (*c, *p))
@@ -311,52 +128,52 @@ fn search(places: &[(i32, i32)], correlation: impl Fn(i32, i32) -> Option<f32>) 
     best
 }
 
-/// From a pixel of one camera's image to its line in the other's.
+/// From a pixel of one camera to its epipolar line in the other.
 struct Ray<'a> {
     lenses: [&'a Lens; 2],
     to: &'a Projection,
-    eye: Vector3<f64>,
+    centre: Vector3<f64>,
     back: nalgebra::Matrix3<f64>,
     baseline: f64,
 }
 
 impl<'a> Ray<'a> {
     fn new(lenses: [&'a Lens; 2], p: [&'a Projection; 2], from: usize) -> Option<Self> {
-        let eyes = [camera_centre(p[0])?, camera_centre(p[1])?];
+        let centres = [camera_centre(p[0])?, camera_centre(p[1])?];
         let m = p[from].fixed_view::<3, 3>(0, 0).into_owned();
         Some(Self {
             lenses: [lenses[from], lenses[1 - from]],
             to: p[1 - from],
-            eye: eyes[from],
+            centre: centres[from],
             back: m.try_inverse()?,
-            baseline: (eyes[0] - eyes[1]).norm(),
+            baseline: (centres[0] - centres[1]).norm(),
         })
     }
 
     /// Unit normal of an ideal pixel's line in the other image.
     fn normal_at(&self, ideal: Pixel) -> Option<Pixel> {
-        let h = self.to * self.eye.push(1.0);
+        let h = self.to * self.centre.push(1.0);
         let d = self.to * (self.back * Vector3::new(ideal.x, ideal.y, 1.0)).push(0.0);
         let l = h.cross(&d);
         Pixel::new(l.x, l.y).try_normalize(1e-12)
     }
 
-    /// Half-size pixels of the other image, one after the other, from near to infinitely far.
-    fn places(&self, raw: Pixel) -> Vec<(i32, i32)> {
+    /// Pixels of the other halved image along the line, from near to infinitely far.
+    fn positions(&self, raw: Pixel) -> Vec<(i32, i32)> {
         let Some(i) = self.lenses[0].ideal(raw) else { return Vec::new() };
         let d = self.back * Vector3::new(i.x, i.y, 1.0);
         let Some(d) = d.try_normalize(0.0) else { return Vec::new() };
         let at = |inverse: f64| -> Option<Pixel> {
-            // A point at 1 / inverse along the ray, in homogeneous coordinates so that infinity is a place like any
-            // other.
-            let h = self.to * (self.eye * inverse + d).push(inverse);
+            // A point at distance 1 / inverse along the ray, in homogeneous coordinates so that infinity needs no
+            // special case.
+            let h = self.to * (self.centre * inverse + d).push(inverse);
             (h.z > 0.0).then(|| Pixel::new(h.x / h.z, h.y / h.z))
         };
-        let nearest = 1.0 / (NEAREST * self.baseline);
+        let nearest = 1.0 / (MIN_DISTANCE * self.baseline);
         let (Some(near), Some(far)) = ((0..20).find_map(|k| at(nearest * (1.0 - 0.05 * f64::from(k)))), at(0.0)) else {
             return Vec::new();
         };
-        let n = (((near - far).norm() / 2.0) as usize).clamp(1, MOST_PLACES);
+        let n = (((near - far).norm() / 2.0) as usize).clamp(1, MAX_POSITIONS);
         let mut out: Vec<(i32, i32)> = Vec::with_capacity(n);
         for k in 0..=n {
             let Some(ideal) = at(nearest * k as f64 / n as f64) else { continue };

@@ -1,17 +1,18 @@
-//! Whether two contours are images of one rim (section 4.2, errata B3).
+//! The epipolar tangency test: whether two ellipses are images of one rim (section 4.2).
 //!
-//! Two image ellipses have 10 parameters and a conic in space 8, so a match obeys two conditions; the paper's
-//! polynomial is one of them. Both are seen in the image: each epipolar line tangent to the left ellipse must be
-//! tangent to the right one.
+//! Two image ellipses have 10 parameters and a conic in space has 8, so that a match satisfies two conditions. The
+//! paper's polynomial (equation 4) is only one of them: it vanishes as soon as one pair of tangents agrees. Both
+//! conditions are visible in the image: each epipolar line tangent to the left ellipse has to be tangent to the right
+//! one.
 
 use crate::offline::conic::{EllipseFit, ellipse_of};
-use crate::offline::rim::model::Projection;
+use crate::offline::types::projection::Projection;
 use nalgebra::{Matrix3, Vector2, Vector3, Vector4};
 
-/// The two epipolar tangency gaps in the right image, pixels, signed; NaN where the epipole lies inside the left
+/// The two signed epipolar tangency gaps in the right image, pixels; NaN where the epipole lies inside the left
 /// ellipse.
 ///
-/// `o_left` is the left projection centre (last coordinate 1), in the frame of both matrices.
+/// `centres` are the projection centres (last coordinate 1) in the frame of both matrices.
 pub fn epipolar_gaps(
     c_left: &Matrix3<f64>,
     p_left: &Projection,
@@ -53,8 +54,8 @@ pub fn epipolar_gaps(
     })
 }
 
-/// The gaps of two fits with their standard deviations, propagated from both covariances (at the given noise, in
-/// units of the fits' sigma).
+/// The gaps of two fits with their standard deviations, propagated from both covariances. `noise` is in units of the
+/// fits' sigma.
 pub fn gaps_with_sigma(
     fits: [&EllipseFit; 2],
     p: [&Projection; 2],
@@ -64,7 +65,7 @@ pub fn gaps_with_sigma(
     let gaps = epipolar_gaps(&fits[0].conic, p[0], &fits[1].conic, p[1], centres);
     let mut variance = [0.0; 2];
     for view in 0..2 {
-        // Steps of a hundredth of a standard deviation keep the difference in the linear range and clear of rounding.
+        // Steps of a hundredth of a standard deviation stay in the linear range and well above rounding.
         let mut slope = [nalgebra::Vector5::zeros(), nalgebra::Vector5::zeros()];
         #[allow(clippy::needless_range_loop)] // k names a parameter of the fit, not an entry of one list.
         for k in 0..5 {
@@ -87,13 +88,12 @@ pub fn gaps_with_sigma(
     (gaps, variance.map(f64::sqrt))
 }
 
-/// Upper limit of the two-view excess at a gate of so many standard deviations.
+/// Upper limit of the two-view excess for a gate in standard deviations.
 ///
-/// With the noise known the excess is chi-squared with 2 degrees of freedom; with the noise estimated from `dof`
-/// residuals it is twice an F(2, dof) variable, whose tail is elementary: `P(x > t) = (1 + t / dof)^(-dof / 2)`.
+/// With known noise the excess is chi-squared with 2 degrees of freedom. With the noise estimated from `dof` residuals
+/// it is twice an F(2, dof) variable, whose tail is elementary: `P(x > t) = (1 + t / dof)^(-dof / 2)`.
 pub fn excess_limit(gate_sigmas: f64, dof: Option<usize>) -> f64 {
-    // Two-sided tail of the normal distribution, by the asymptotic series' leading bound; exact enough for a gate
-    // (within 6 % at 4 sigma).
+    // Two-sided tail of the normal distribution, by the leading terms of its asymptotic series: within 6 % at 4 sigma.
     let z = gate_sigmas.max(1.0);
     let tail = 2.0 * (-0.5 * z * z).exp() / (z * (2.0 * std::f64::consts::PI).sqrt())
         * (1.0 - 1.0 / (z * z) + 3.0 / z.powi(4));
@@ -111,7 +111,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_gate_is_the_chi_squared_tail_and_widens_when_the_noise_is_little_known() {
+    fn the_limit_is_the_chi_squared_tail_and_widens_with_few_degrees_of_freedom() {
         let known = excess_limit(4.0, None);
         assert!((known - 19.33).abs() < 0.1, "{known}");
         assert!((excess_limit(4.0, Some(1_000_000)) - known).abs() < 0.01);

@@ -1,30 +1,30 @@
-//! A circle that might be an ellipse after all.
+//! Averaging of a circle with the ellipse that it may be.
 //!
-//! That a rim is a circle is assumed where its edges do not speak against it, and a circle's normal is several times
-//! as certain as an ellipse's. A rim that is an ellipse by a hundredth, or a rig that makes one of it, is then wrong
-//! by more than the circle's covariance admits. So the answer stays the circle, and its covariance becomes that of
-//! both models together, each by its probability.
+//! A rim is taken for a circle where its edges do not contradict that, and the normal of a circle is several times as
+//! certain as that of an ellipse. If the rim is an ellipse by one percent, or an error of the rig makes it look like
+//! one, the error exceeds the covariance of the circle. The answer therefore stays the circle, and its covariance
+//! becomes that of both models together, each weighted by its probability.
 
 use crate::offline::rim::circle::frame_of;
 use crate::offline::rim::model::Reconstruction;
 use nalgebra::{Matrix2, Vector2};
 
-/// Widens a reconstruction's covariance by that of another model of the same edges, which has this probability.
-pub(in crate::offline) fn average(r: &mut Reconstruction, other: &Reconstruction, share: f64) {
+/// Widens a reconstruction's covariance by that of another model of the same edges with probability `weight`.
+pub(in crate::offline) fn average(r: &mut Reconstruction, other: &Reconstruction, weight: f64) {
     let (f, g) = (frame_of(&r.rim.normal), frame_of(&other.rim.normal));
     let (f, g) = (f.fixed_columns::<2>(0), g.fixed_columns::<2>(0));
     let turn: Matrix2<f64> = f.transpose() * g;
     let normal: Vector2<f64> = f.transpose() * (other.rim.normal - r.rim.normal);
     let centre = other.rim.centre - r.rim.centre;
     let axes = Vector2::new(other.rim.a - r.rim.a, other.rim.b - r.rim.b);
-    let own = 1.0 - share;
-    r.cov_centre = r.cov_centre * own + (other.cov_centre + centre * centre.transpose()) * share;
+    let own = 1.0 - weight;
+    r.cov_centre = r.cov_centre * own + (other.cov_centre + centre * centre.transpose()) * weight;
     let cov = turn * other.cov_normal * turn.transpose();
-    r.cov_normal = r.cov_normal * own + (cov + normal * normal.transpose()) * share;
+    r.cov_normal = r.cov_normal * own + (cov + normal * normal.transpose()) * weight;
     let cov = other.cov_centre_normal * turn.transpose();
-    r.cov_centre_normal = r.cov_centre_normal * own + (cov + centre * normal.transpose()) * share;
-    r.cov_axes = r.cov_axes * own + (other.cov_axes + axes * axes.transpose()) * share;
-    let grown = |own: f64, of: f64, by: f64| ((1.0 - share) * own * own + share * (of * of + by * by)).sqrt();
+    r.cov_centre_normal = r.cov_centre_normal * own + (cov + centre * normal.transpose()) * weight;
+    r.cov_axes = r.cov_axes * own + (other.cov_axes + axes * axes.transpose()) * weight;
+    let grown = |own: f64, of: f64, by: f64| ((1.0 - weight) * own * own + weight * (of * of + by * by)).sqrt();
     let (mine, theirs) = (&mut r.report, &other.report);
     mine.sigma_centre_in_images = grown(mine.sigma_centre_in_images, theirs.sigma_centre_in_images, centre.norm());
     mine.sigma_normal_in_images = grown(mine.sigma_normal_in_images, theirs.sigma_normal_in_images, normal.norm());
@@ -35,9 +35,10 @@ pub(in crate::offline) fn average(r: &mut Reconstruction, other: &Reconstruction
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::offline::rim::model::{EdgePoint, Options, Outline, RimChoice};
-    use crate::offline::rim::reconstruct::reconstruct;
+    use crate::offline::decide::reconstruct::reconstruct;
+    use crate::offline::rim::model::{Options, RimChoice};
     use crate::offline::rim::synthetic::{Random, rig, rim_points, rim_tilted};
+    use crate::offline::types::{EdgePoint, Outline};
     use nalgebra::{SVector, Vector3};
 
     /// Centre and normal relative to a circle's, drawn from a reconstruction's own covariance.
@@ -64,13 +65,13 @@ mod tests {
         let truth = rim_tilted(Vector3::new(0.02, -0.05, 1.5), 0.5, 1.0, 0.075, 0.0745);
         let mut random = Random::new(9);
         let points = [0, 1].map(|v| {
-            let place =
+            let noisy =
                 |uv: nalgebra::Vector2<f64>, r: &mut Random| uv + nalgebra::Vector2::new(r.normal(), r.normal()) * 0.2;
-            let one = |uv, r: &mut Random| EdgePoint { uv: place(uv, r), sigma: 0.2, outline: Outline::Outer };
+            let one = |uv, r: &mut Random| EdgePoint { uv: noisy(uv, r), sigma: 0.2, outline: Outline::Outer };
             rim_points(&p[v], &truth, 200).into_iter().map(|uv| one(uv, &mut random)).collect::<Vec<_>>()
         });
         let fit = |rim| {
-            let o = Options { rim, ..Options::default() }.tolerating_anything();
+            let o = Options { rim, ..Options::default() }.without_tolerance();
             reconstruct(&points[0], &p[0], &points[1], &p[1], &o).unwrap()
         };
         let (circle, ellipse) = (fit(RimChoice::Circle), fit(RimChoice::Ellipse));

@@ -1,19 +1,21 @@
-//! A round bar against everything else that its four outlines might be.
+//! A round bar against the other models of its four outlines.
 
 use crate::offline::bar::found::BarFound;
 use crate::offline::bar::torus::Torus;
 use crate::offline::correspondence::rig_error::RigError;
 use crate::offline::decide::likelihood::{Fitted, Hypothesis, Shape, Stretch, fit};
-use crate::offline::decide::models::{Model, UNEVEN, Weighed, each_alone, prior, stretch, unrelated_px};
-use crate::offline::rim::model::{Options, Outline, RimModel};
+use crate::offline::decide::models::{Model, UNEVENNESS, Weighed, each_alone, prior, stretch, unrelated_px};
+use crate::offline::rim::model::{Options, RimModel};
 use crate::offline::rim::planar::{Analysis, analyse};
+use crate::offline::types::Outline;
 
-/// What is known of a bar whose diameter somebody said: callipers on a painted bar are good to a hundredth of it.
-const SAID: f64 = 0.01;
+/// Relative standard deviation of a bar radius that the operator gave: callipers on a painted bar are accurate to one
+/// percent.
+const KNOWN_RADIUS_SIGMA: f64 = 0.01;
 
-/// The bar's radius and its relative uncertainty, where the operator has said its diameter.
+/// The bar's radius and its relative standard deviation, where the operator gave its diameter.
 pub(in crate::offline) fn known_radius(options: &Options) -> Option<(f64, f64)> {
-    options.bar_diameter.map(|d| (0.5 * d, SAID))
+    options.bar_diameter.map(|d| (0.5 * d, KNOWN_RADIUS_SIGMA))
 }
 
 /// A bar's four outlines with the models that explain them.
@@ -23,14 +25,14 @@ pub(in crate::offline) struct FourOutlines {
     pub(in crate::offline) found: BarFound,
     /// The outlines' points.
     pub(in crate::offline) stretches: Vec<Stretch>,
-    /// The outer outlines as if they were plane.
+    /// The plane analysis of the outer outlines.
     pub(in crate::offline) outer: Analysis,
-    /// The bar, a flat ring with two edges, and contours that have nothing to do with each other.
+    /// The bar, a flat ring with two edges, and unrelated contours, each with its evidence.
     pub(in crate::offline) models: Vec<Weighed>,
 }
 
 impl FourOutlines {
-    /// Weighs a bar that was found. `None` where not even the outer outlines can be analysed.
+    /// Weighs the models of a bar that was found. `None` where the outer outlines cannot be analysed.
     pub(in crate::offline) fn new(found: BarFound, rig: &RigError, options: &Options) -> Option<Self> {
         let p = [&rig.p[0], &rig.p[1]];
         let stretches: Vec<Stretch> = [0, 1]
@@ -39,12 +41,12 @@ impl FourOutlines {
                 [stretch(k, &found.outer[k], Outline::Outer, 0), stretch(k, &found.inner[k], Outline::Inner, 0)]
             })
             .collect();
-        // The inner outline is a rim of its own if the ring is flat.
+        // On a flat ring the inner outline is a second rim.
         let apart: Vec<Stretch> =
             stretches.iter().enumerate().map(|(n, s)| Stretch { shape: n % 2, ..s.clone() }).collect();
         let plain = |n: usize| -> Vec<_> {
             let points = apart.get(n).map(|s| s.points.as_slice()).unwrap_or_default();
-            points.iter().map(|q| crate::offline::rim::model::EdgePoint { outline: Outline::Outer, ..*q }).collect()
+            points.iter().map(|q| crate::offline::types::EdgePoint { outline: Outline::Outer, ..*q }).collect()
         };
         let lenient = Options { robust: true, ..*options };
         let outer = analyse([&plain(0), &plain(2)], p, &lenient).ok()?;
@@ -64,7 +66,7 @@ impl FourOutlines {
         if let Ok(inner) = &inner {
             let pick = |a: &Analysis, model| match model {
                 RimModel::Circle => a.circle.as_ref().ok().map(|f| Shape::Circle(f.rim)),
-                _ => a.ellipse.as_ref().ok().map(|f| Shape::Ellipse(f.rim, UNEVEN)),
+                _ => a.ellipse.as_ref().ok().map(|f| Shape::Ellipse(f.rim, UNEVENNESS)),
             };
             let px = unrelated_px([&found.outer[0], &found.outer[1]]);
             for (model, kind, unrelated) in [
@@ -87,7 +89,7 @@ impl FourOutlines {
         self.models.iter().find(|m| m.model == Model::Bar).map(|m| &m.fitted)
     }
 
-    /// Logarithm of the odds of the bar against everything else.
+    /// Log odds of the bar against every other model.
     pub(in crate::offline) fn log_odds(&self) -> f64 {
         let best = |bar: bool| {
             let logs = self.models.iter().filter(|m| (m.model == Model::Bar) == bar).map(|m| m.log);
@@ -95,7 +97,7 @@ impl FourOutlines {
         };
         match (best(true), best(false)) {
             (b, _) if b == f64::NEG_INFINITY => f64::NEG_INFINITY,
-            // Nothing to hold it against is no evidence.
+            // Without an alternative there is no evidence.
             (_, f) if f == f64::NEG_INFINITY => 0.0,
             (b, f) => b - f,
         }

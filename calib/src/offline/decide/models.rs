@@ -5,9 +5,11 @@ use crate::offline::contour::Contour;
 use crate::offline::correspondence::rig_error::RigError;
 use crate::offline::decide::likelihood::{Fitted, Hypothesis, Shape, Stretch, fit};
 use crate::offline::rim::circle::signed_axis;
-use crate::offline::rim::cone::{camera_centre, ray};
-use crate::offline::rim::model::{Ellipse2, Outline, Projection, Rim, RimChoice};
+use crate::offline::rim::model::{Rim, RimChoice};
 use crate::offline::rim::planar::Analysis;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::{camera_centre, ray};
+use crate::offline::types::{Ellipse2, Outline};
 use nalgebra::Vector2;
 
 /// A model of some contours.
@@ -17,11 +19,11 @@ pub(in crate::offline) enum Model {
     Circle,
     /// A plane ellipse.
     Ellipse,
-    /// A plane rim that is meant to be round and is not quite.
+    /// A plane rim that is meant to be round and is not exactly.
     NearlyRound,
     /// A round bar.
     Bar,
-    /// Two contours that have nothing to do with each other.
+    /// Two unrelated contours.
     Unrelated,
     /// A circle of which the cameras see opposite faces.
     Opposite,
@@ -32,58 +34,61 @@ pub(in crate::offline) enum Model {
 pub(in crate::offline) struct Weighed {
     /// The model.
     pub(in crate::offline) model: Model,
-    /// At its optimum.
+    /// The model at its optimum.
     pub(in crate::offline) fitted: Fitted,
     /// Logarithm of evidence times prior probability.
     pub(in crate::offline) log: f64,
 }
 
-/// Prior probabilities. They matter little: a model that is right cycles the others by tens of units of the logarithm,
-/// and what does not is asked about.
+/// Prior probability of unrelated contours: an operator selects the same contour in both images, but the candidates
+/// include its neighbours.
 ///
-/// A hand chooses the same contour in both images, and the contours offered to it include its neighbours; rims are
-/// circles more often than ellipses.
-const UNRELATED: f64 = 0.2;
-const OPPOSITE: f64 = 0.01;
-const ELLIPSE: f64 = 0.15;
-const CIRCLE: f64 = 1.0 - UNRELATED - OPPOSITE - ELLIPSE;
-/// Probability of what the operator has said is something else.
-const MISNAMED: f64 = 1e-3;
+/// The priors matter little: a correct model exceeds the others by tens of units of the log evidence, and the operator
+/// is asked where it does not.
+const P_UNRELATED: f64 = 0.2;
+/// Prior probability that the cameras look at opposite faces.
+const P_OPPOSITE: f64 = 0.01;
+/// Prior probability of an ellipse: rims are circles more often.
+const P_ELLIPSE: f64 = 0.15;
+/// Prior probability of a circle.
+const P_CIRCLE: f64 = 1.0 - P_UNRELATED - P_OPPOSITE - P_ELLIPSE;
+/// Prior probability of a model that contradicts the operator.
+const P_MISNAMED: f64 = 1e-3;
+/// Fraction of the round rims that are round only to one percent: bent, worn, or made so.
+const P_NEARLY_ROUND: f64 = 0.2;
+/// Standard deviation of an ellipse from round (see [`Shape::Ellipse`]).
+pub(in crate::offline) const UNEVENNESS: f64 = 0.25;
+/// The same for a rim that is meant to be round.
+const NEARLY_ROUND_UNEVENNESS: f64 = 0.01;
 
-/// Part of the round rims that are round to a hundredth only: bent, worn, or made so.
-const NEARLY: f64 = 0.2;
-/// How far an ellipse, and how far a rim that is meant to be round, is from round (see [`Shape::Ellipse`]).
-pub(in crate::offline) const UNEVEN: f64 = 0.25;
-const NEARLY_UNEVEN: f64 = 0.01;
+/// Standard deviation of the displacement between unrelated contours, as a fraction of their semi-major axis.
+const UNRELATED_FRACTION: f64 = 0.4;
 
-/// How far unrelated contours lie from each other, as a fraction of their semi-major axis.
-const UNRELATED_PART: f64 = 0.4;
-
-/// Prior probability of a plane model under the operator's words.
+/// Prior probability of a model under the operator's choice.
 pub(in crate::offline) fn prior(model: Model, choice: RimChoice) -> f64 {
     match (model, choice) {
-        (Model::Unrelated, _) => UNRELATED,
-        (Model::Opposite, _) => OPPOSITE,
-        (Model::Circle, RimChoice::Ellipse) | (Model::Ellipse, RimChoice::Circle) => MISNAMED * CIRCLE,
-        (Model::NearlyRound, RimChoice::Circle | RimChoice::Ellipse) => MISNAMED * CIRCLE,
-        (Model::NearlyRound, _) => NEARLY * CIRCLE,
-        (Model::Circle, _) => (1.0 - NEARLY) * CIRCLE,
-        (Model::Ellipse, RimChoice::Ellipse) => CIRCLE,
-        (Model::Ellipse, _) => ELLIPSE,
-        (Model::Bar, RimChoice::RoundBar) => 1.0 - MISNAMED,
+        (Model::Unrelated, _) => P_UNRELATED,
+        (Model::Opposite, _) => P_OPPOSITE,
+        (Model::Circle, RimChoice::Ellipse) | (Model::Ellipse, RimChoice::Circle) => P_MISNAMED * P_CIRCLE,
+        (Model::NearlyRound, RimChoice::Circle | RimChoice::Ellipse) => P_MISNAMED * P_CIRCLE,
+        (Model::NearlyRound, _) => P_NEARLY_ROUND * P_CIRCLE,
+        (Model::Circle, _) => (1.0 - P_NEARLY_ROUND) * P_CIRCLE,
+        (Model::Ellipse, RimChoice::Ellipse) => P_CIRCLE,
+        (Model::Ellipse, _) => P_ELLIPSE,
+        (Model::Bar, RimChoice::RoundBar) => 1.0 - P_MISNAMED,
         (Model::Bar, RimChoice::Auto) => 0.5,
-        (Model::Bar, _) => MISNAMED,
+        (Model::Bar, _) => P_MISNAMED,
     }
 }
 
-/// The stretch of a contour.
+/// A contour's points as input of the likelihood.
 pub(in crate::offline) fn stretch(view: usize, c: &Contour, outline: Outline, shape: usize) -> Stretch {
-    Stretch { view, points: c.edge_points(outline), place: c.points.iter().map(|p| p.parameter).collect(), shape }
+    Stretch { view, points: c.edge_points(outline), parameter: c.points.iter().map(|p| p.parameter).collect(), shape }
 }
 
-/// How far apart unrelated contours are, pixels.
+/// Standard deviation of the displacement between unrelated contours, pixels.
 pub(in crate::offline) fn unrelated_px(contours: [&Contour; 2]) -> f64 {
-    UNRELATED_PART * contours[0].ellipse.a.min(contours[1].ellipse.a)
+    UNRELATED_FRACTION * contours[0].ellipse.a.min(contours[1].ellipse.a)
 }
 
 /// Plane models of two contours, and the alternative that they are unrelated. Empty where no plane carries them.
@@ -111,9 +116,9 @@ pub(in crate::offline) fn plane_models(
         weigh(Model::Circle, Shape::Circle(start), None);
     }
     if let Some(start) = ellipse.or(circle) {
-        weigh(Model::Ellipse, Shape::Ellipse(start, UNEVEN), None);
-        weigh(Model::NearlyRound, Shape::Ellipse(start, NEARLY_UNEVEN), None);
-        weigh(Model::Unrelated, Shape::Ellipse(start, UNEVEN), Some(unrelated_px(contours)));
+        weigh(Model::Ellipse, Shape::Ellipse(start, UNEVENNESS), None);
+        weigh(Model::NearlyRound, Shape::Ellipse(start, NEARLY_ROUND_UNEVENNESS), None);
+        weigh(Model::Unrelated, Shape::Ellipse(start, UNEVENNESS), Some(unrelated_px(contours)));
     }
     if let Some((start, _)) = a.between {
         weigh(Model::Opposite, Shape::Circle(start), None);
@@ -123,23 +128,23 @@ pub(in crate::offline) fn plane_models(
     out
 }
 
-/// Contours that have nothing to do with each other, each as an ellipse of its own image.
+/// Unrelated contours, each as an ellipse of its own image.
 ///
-/// [`Hypothesis::unrelated_px`] starts from a rim, and says nothing where contours are so far from one that it leads nowhere. An ellipse of
-/// one image always fits, so that whatever is held against it has to fit the edges as well. Its size and place in space
-/// cannot be seen, and cost as much as their prior is wide.
+/// [`Hypothesis::unrelated_px`] starts from a rim, and has no solution for contours too far from one. An ellipse in
+/// one image always fits, so that every alternative has to fit the edges as well. Its size and position in space are
+/// unobservable, and cost the width of their prior.
 pub(in crate::offline) fn each_alone(
     stretches: &[Stretch],
     ellipses: &[&Ellipse2],
     choice: RimChoice,
     rig: &RigError,
 ) -> Option<Weighed> {
-    let believed = rig.held(rig.given());
+    let given = rig.held(rig.given());
     let mut all: Option<Fitted> = None;
     for (s, e) in stretches.iter().zip(ellipses) {
-        let shapes = vec![Shape::Ellipse(facing(e, believed.p.get(s.view)?)?, UNEVEN)];
+        let shapes = vec![Shape::Ellipse(fronto_parallel(e, given.p.get(s.view)?)?, UNEVENNESS)];
         let own = [Stretch { shape: 0, ..s.clone() }];
-        let fitted = fit(&Hypothesis { shapes, unrelated_px: None }, &own, &believed)?;
+        let fitted = fit(&Hypothesis { shapes, unrelated_px: None }, &own, &given)?;
         all = Some(match all {
             None => fitted,
             Some(f) => Fitted { log_evidence: f.log_evidence + fitted.log_evidence, ..f },
@@ -150,12 +155,12 @@ pub(in crate::offline) fn each_alone(
     Some(Weighed { model: Model::Unrelated, fitted, log })
 }
 
-/// The rim parallel to a camera's image, a metre before it, that looks like an ellipse there.
-fn facing(e: &Ellipse2, p: &Projection) -> Option<Rim> {
+/// The rim parallel to a camera's image, one metre in front of it, that projects to an ellipse.
+fn fronto_parallel(e: &Ellipse2, p: &Projection) -> Option<Rim> {
     let back = p.fixed_view::<3, 3>(0, 0).into_owned().try_inverse()?;
     let (sin, cos) = e.theta.sin_cos();
     let ahead = back * e.centre.push(1.0);
-    // Of unit length along the ray; turned to the front by `ray`.
+    // Distance one along the ray; `ray` points to the front.
     let reach = ray(p, e.centre.x, e.centre.y)?.dot(&ahead).recip();
     let (major, minor) = (Vector2::new(cos, sin) * e.a, Vector2::new(-sin, cos) * e.b);
     let (u, v) = (back * major.push(0.0) * reach, back * minor.push(0.0) * reach);
@@ -165,7 +170,7 @@ fn facing(e: &Ellipse2, p: &Projection) -> Option<Rim> {
     Some(Rim { centre, normal, a: u.norm(), b: v.norm(), axis_a, axis_b: normal.cross(&axis_a) })
 }
 
-/// A bar of which two contours would be the outer outlines, and nothing else is seen.
+/// A bar with two contours as its outer outlines, when nothing else of it is visible.
 pub(in crate::offline) fn bar_alone(
     contours: [&Contour; 2],
     start: Torus,
@@ -176,7 +181,7 @@ pub(in crate::offline) fn bar_alone(
     fit(&Hypothesis { shapes: vec![Shape::Bar(start, known)], unrelated_px: None }, &stretches, rig)
 }
 
-/// Probabilities of weighed models.
+/// Normalised probabilities of log weights.
 pub(in crate::offline) fn probabilities(logs: &[f64]) -> Vec<f64> {
     let most = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     let each: Vec<f64> = logs.iter().map(|l| (l - most).exp()).collect();
@@ -188,17 +193,17 @@ pub(in crate::offline) fn probabilities(logs: &[f64]) -> Vec<f64> {
 mod tests {
     use super::*;
     use crate::offline::conic::{ellipse_of, orient};
-    use crate::offline::rim::cone::project;
-    use crate::offline::rim::model::EdgePoint;
     use crate::offline::rim::synthetic::{rig, rim_point, rim_points, rim_tilted};
+    use crate::offline::types::EdgePoint;
+    use crate::offline::types::projection::project;
     use graspd_rt::geom::{Camera, Distortion, Rig};
     use nalgebra::{Matrix3, Vector3};
 
     #[test]
-    fn a_rim_parallel_to_the_image_looks_like_the_ellipse_it_was_made_for() {
+    fn a_fronto_parallel_rim_projects_to_its_ellipse() {
         let e = Ellipse2 { centre: Vector2::new(700.0, 420.0), a: 90.0, b: 55.0, theta: 0.7 };
         for p in rig(0.5, 1200.0, 1.5) {
-            let rim = facing(&e, &p).unwrap();
+            let rim = fronto_parallel(&e, &p).unwrap();
             for k in 0..12 {
                 let uv = project(&p, &rim_point(&rim, f64::from(k) * 0.5)) - e.centre;
                 let (sin, cos) = e.theta.sin_cos();
@@ -208,8 +213,8 @@ mod tests {
         }
     }
 
-    /// Evidence of two contours as one rim against each as an ellipse of its own image; the right one is higher over the epipolar lines by
-    /// a factor, about its middle.
+    /// Log odds of one rim against an ellipse in each image. The right image is stretched across the epipolar lines
+    /// about its middle by a factor.
     fn odds(higher: f64) -> f64 {
         let camera = Camera {
             fx: 1200.0,
@@ -222,7 +227,7 @@ mod tests {
         };
         let mut right_from_left = graspd_rt::geom::Pose::identity();
         right_from_left.translation.vector.x = -0.3;
-        let rig = RigError::none(&Rig { left: camera, right: camera, right_from_left });
+        let rig = RigError::exact(&Rig { left: camera, right: camera, right_from_left });
         let rim = rim_tilted(Vector3::new(0.1, 0.02, 1.2), 0.5, 1.0, 0.08, 0.08);
         let views = [0, 1].map(|k| {
             let middle = project(&rig.p[k], &rim.centre);
@@ -235,12 +240,12 @@ mod tests {
         let stretches = [0, 1].map(|view| Stretch {
             view,
             points: views[view].iter().map(|uv| EdgePoint { uv: *uv, sigma: 0.1, outline: Outline::Outer }).collect(),
-            place: (0..120).map(|k| f64::from(k) * std::f64::consts::TAU / 120.0).collect(),
+            parameter: (0..120).map(|k| f64::from(k) * std::f64::consts::TAU / 120.0).collect(),
             shape: 0,
         });
         let ellipses = views.each_ref().map(|v| ellipse_through(v));
         let alone = each_alone(&stretches, &[&ellipses[0], &ellipses[1]], RimChoice::Auto, &rig).unwrap();
-        let shapes = vec![Shape::Ellipse(rim, UNEVEN)];
+        let shapes = vec![Shape::Ellipse(rim, UNEVENNESS)];
         let one = fit(&Hypothesis { shapes, unrelated_px: None }, &stretches, &rig);
         one.map_or(f64::NEG_INFINITY, |f| f.log_evidence) + prior(Model::Ellipse, RimChoice::Auto).ln() - alone.log
     }
@@ -254,9 +259,9 @@ mod tests {
     }
 
     #[test]
-    fn one_rim_is_held_against_an_ellipse_in_each_image_on_both_sides() {
+    fn one_rim_wins_over_two_ellipses_only_if_it_fits() {
         let (same, other) = (odds(1.0), odds(1.1));
-        assert!(same > -MISNAMED.ln(), "one rim: {same}");
-        assert!(other < MISNAMED.ln(), "no rim has both: {other}");
+        assert!(same > -P_MISNAMED.ln(), "one rim: {same}");
+        assert!(other < P_MISNAMED.ln(), "two contours: {other}");
     }
 }

@@ -1,19 +1,21 @@
-//! Ellipses proposed without a click: found in each view, paired by the two-view condition, ranked.
+//! Rims proposed without a click: ellipses found in each view, paired by the two-view condition, ranked.
 
 use crate::offline::contour::quick_fit::Walk;
 use crate::offline::contour::select::Candidate;
 use crate::offline::contour::{Contour, ViewEdges, alike};
-use crate::offline::rim::model::{Ellipse2, Options, Outline, Projection, Reconstruction, RimChoice};
-use crate::offline::rim::reconstruct::reconstruct;
+use crate::offline::decide::reconstruct::reconstruct;
+use crate::offline::rim::model::{Options, Reconstruction, RimChoice};
+use crate::offline::types::projection::Projection;
+use crate::offline::types::{Ellipse2, Outline};
 
 /// A rim proposed to the operator.
 #[derive(Clone, Debug)]
 pub struct Proposal {
     /// Its contours, left and right.
     pub contours: [Contour; 2],
-    /// The plane rim that they are an image of.
+    /// The plane rim that they are images of.
     pub reconstruction: Reconstruction,
-    /// By which proposals are ranked: complete, large and consistent first.
+    /// Rank of the proposal: complete, large and consistent rims first.
     pub score: f64,
 }
 
@@ -24,27 +26,26 @@ impl Proposal {
     }
 }
 
-/// Seeds tried in a view: arcs that turn, longest first.
-const SEEDS: usize = 120;
-/// Part of an ellipse that has to carry edges.
-const COVERED: f64 = 0.5;
-/// Part that has to carry edges before a trial ellipse is settled on the edges that it gathers: less than in the end,
-/// as settling gathers more.
-const PROMISING: f64 = 0.4;
-/// Ellipses kept of a view.
-const KEPT: usize = 40;
+/// Largest number of seeds per view: arcs that turn, longest first.
+const MAX_SEEDS: usize = 120;
+/// Smallest fraction of an ellipse that has to carry edges.
+const MIN_COVERAGE: f64 = 0.5;
+/// The same before a trial ellipse is refitted to its edges: smaller, since refitting collects more.
+const MIN_TRIAL_COVERAGE: f64 = 0.4;
+/// Largest number of ellipses per view.
+const MAX_ELLIPSES: usize = 40;
 
-/// Every ellipse worth mentioning in one view, best first. `watch` is told what part of the seeds is done.
+/// The clearest ellipses of one view, best first. `watch` receives the completed fraction.
 pub fn ellipses(edges: &ViewEdges<'_>, mut watch: impl FnMut(f64)) -> Vec<Contour> {
     let mut seeds: Vec<_> = edges.arcs.arcs.iter().filter(|a| a.turn.abs() > 0.35 && a.edges.len() >= 16).collect();
     seeds.sort_by(|a, b| (b.turn.abs() * b.edges.len() as f64).total_cmp(&(a.turn.abs() * a.edges.len() as f64)));
-    seeds.truncate(SEEDS);
+    seeds.truncate(MAX_SEEDS);
     let mut out: Vec<Contour> = Vec::new();
     for (k, arc) in seeds.iter().enumerate() {
         watch(k as f64 / seeds.len() as f64);
         let Some(seed) = arc.edges.get(arc.edges.len() / 2) else { continue };
         let Some(at) = edges.arcs.ideal.get(*seed as usize) else { continue };
-        // An arc that lies on an ellipse already found says nothing new.
+        // An arc on an ellipse already found adds nothing.
         let known = out.iter().any(|c| {
             let (d, n, _) = Walk::new(&c.ellipse).measure(at.at);
             let sign = if c.bright_inside { -1.0 } else { 1.0 };
@@ -56,25 +57,26 @@ pub fn ellipses(edges: &ViewEdges<'_>, mut watch: impl FnMut(f64)) -> Vec<Contou
         let is_known = |out: &[Contour], e: &Ellipse2, bright_inside: bool| {
             out.iter().any(|o| alike(&o.ellipse, e) && o.bright_inside == bright_inside)
         };
-        // Nor does one that leads to it: most of the time would be spent on finding it again.
-        let trial = edges.promising(*seed as usize, PROMISING).filter(|t| t.coverage >= COVERED);
+        // Nor does an arc that leads to such an ellipse: most of the time would be spent on finding it again.
+        let trial = edges.promising(*seed as usize, MIN_TRIAL_COVERAGE).filter(|t| t.coverage >= MIN_COVERAGE);
         let Some(trial) = trial.filter(|t| !is_known(&out, &t.ellipse, t.bright_inside)) else { continue };
-        let contour = edges.contour(&trial).filter(|c| c.coverage > COVERED && c.rms_px < 0.6 && c.points.len() >= 20);
+        let contour =
+            edges.contour(&trial).filter(|c| c.coverage > MIN_COVERAGE && c.rms_px < 0.6 && c.points.len() >= 20);
         if let Some(c) = contour.filter(|c| !is_known(&out, &c.ellipse, c.bright_inside)) {
             out.push(c);
         }
     }
-    out.sort_by(|a, b| worth(b).total_cmp(&worth(a)));
-    out.truncate(KEPT);
+    out.sort_by(|a, b| quality(b).total_cmp(&quality(a)));
+    out.truncate(MAX_ELLIPSES);
     out
 }
 
-fn worth(c: &Contour) -> f64 {
+fn quality(c: &Contour) -> f64 {
     c.coverage * c.coverage * (c.points.len() as f64).sqrt() / (0.15 + c.rms_px)
 }
 
-/// Pairs the ellipses of both views that reconstruct to a rim, best first, at most `most`. `watch` is told what part
-/// of the work is done.
+/// Pairs the ellipses of both views that reconstruct to a rim, best first, at most `most`. `watch` receives the
+/// completed fraction.
 pub fn propose(
     views: &[ViewEdges<'_>; 2],
     p: [&Projection; 2],
@@ -96,11 +98,11 @@ pub fn propose(
             }
             if let Ok(rec) = reconstruct(&a, p[0], &r.edge_points(Outline::Outer), p[1], &options) {
                 let gap = rec.report.gap_px.iter().filter(|g| g.is_finite()).map(|g| g.abs()).fold(0.0, f64::max);
-                found.push(((worth(l) * worth(r)).sqrt() / (0.3 + gap), i, j, rec));
+                found.push(((quality(l) * quality(r)).sqrt() / (0.3 + gap), i, j, rec));
             }
         }
     }
-    // The best pair first; each ellipse is the image of one rim only.
+    // Best pair first; each ellipse is the image of one rim only.
     found.sort_by(|a, b| b.0.total_cmp(&a.0));
     let (mut used_left, mut used_right) = (vec![false; left.len()], vec![false; right.len()]);
     let mut out = Vec::new();

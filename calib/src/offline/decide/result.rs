@@ -1,26 +1,29 @@
-//! From the likelihood's answer to a reconstruction: covariances, absolute and in the images, and the report.
+//! From the result of the likelihood to a reconstruction: covariances, absolute and in the images, and the report.
 
 use crate::offline::correspondence::rig_error::RigError;
 use crate::offline::decide::likelihood::{Fitted, Shape, Stretch, corrected};
+use crate::offline::rim::choice::base_report;
 use crate::offline::rim::circle::{check_front, frame_of, signed_axis, vergence};
-use crate::offline::rim::cone::project;
-use crate::offline::rim::model::{EdgePoint, Projection, Reconstruction, Rim, RimModel, Score};
+use crate::offline::rim::model::{Reconstruction, Rim, RimModel, Score};
 use crate::offline::rim::planar::Analysis;
-use crate::offline::rim::reconstruct::base_report;
 use crate::offline::rim::refusal::Refusal;
+use crate::offline::types::EdgePoint;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::project;
 use nalgebra::{DMatrix, Matrix2, Matrix2x3, Matrix3, SMatrix, SVector, Vector2, Vector3};
 
-/// Where a gripper's marks stand on the grasp: at this distance from the axis and this far before the rim's plane,
-/// metres. Marks farther from the rim see less of its depth error cancelled.
-const MARKS_ASIDE_M: f64 = 0.05;
-const MARKS_BEFORE_M: f64 = 0.08;
-/// Number of places on that circle.
+/// Distance of a typical gripper's marks from the axis of the grasp, metres.
+const MARK_RADIUS_M: f64 = 0.05;
+/// Distance of the marks in front of the rim's plane, metres. Marks farther from the rim cancel less of its depth
+/// error.
+const MARK_HEIGHT_M: f64 = 0.08;
+/// Number of marks on that circle.
 const MARKS: usize = 8;
 
 /// Builds the reconstruction of a fitted model.
 ///
-/// `points` are the points of each view in the order of the report's residuals; `stretches` say to which of them each
-/// residual belongs.
+/// `points` are the points of each view in the order of the report's residuals; `stretches` assign each residual to
+/// one of them.
 pub(in crate::offline) fn reconstruction(
     fitted: &Fitted,
     scores: Vec<Score>,
@@ -32,8 +35,8 @@ pub(in crate::offline) fn reconstruction(
     let shape = fitted.shapes.first().ok_or(Refusal::NoFit { why: "there is no shape" })?;
     let (model, rim, bar_radius) = rim_of(shape);
     let p = [0, 1].map(|k| corrected(rig, &fitted.phi, k));
-    let whole = bar_radius.unwrap_or(0.0);
-    check_front(&Rim { a: rim.a + whole, b: rim.b + whole, ..rim }, [&p[0], &p[1]], &a.centres)?;
+    let tube = bar_radius.unwrap_or(0.0);
+    check_front(&Rim { a: rim.a + tube, b: rim.b + tube, ..rim }, [&p[0], &p[1]], &a.centres)?;
     let cov = &fitted.cov;
     let cov_centre: Matrix3<f64> = cov.fixed_view::<3, 3>(0, 0).into_owned();
     let cov_normal: Matrix2<f64> = cov.fixed_view::<2, 2>(3, 3).into_owned();
@@ -47,7 +50,7 @@ pub(in crate::offline) fn reconstruction(
     report.noise = fitted.kappa;
     report.smooth_px = fitted.wave_px;
     report.scores = scores;
-    place_residuals(&mut report.residuals, &mut report.inliers, fitted, stretches);
+    assign_residuals(&mut report.residuals, &mut report.inliers, fitted, stretches);
     Ok(Reconstruction {
         model,
         rim,
@@ -80,8 +83,8 @@ fn cov_axes(shape: &Shape, cov: &DMatrix<f64>) -> Matrix2<f64> {
     }
 }
 
-/// Stretches lie one after the other in each view.
-fn place_residuals(
+/// The stretches of a view are consecutive.
+fn assign_residuals(
     residuals: &mut [Vec<f64>; 2],
     inliers: &mut [Vec<bool>; 2],
     fitted: &Fitted,
@@ -103,19 +106,19 @@ fn place_residuals(
     }
 }
 
-/// Motion of a gripper whose marks stay at their places in both images while the cameras change by each of the rig's
-/// modes: translation at the rim's centre and rotation.
+/// Motion of a gripper whose marks keep their positions in both images while the cameras change by each mode of the
+/// rig: translation at the rim's centre, and rotation.
 ///
-/// With `J` the marks' derivative by the gripper's pose, a mode `dP` moves the pose that the images show by `xi =
-/// -J^+ dP x`. `None` where the images do not determine the pose.
+/// With `J` the derivative of the marks by the gripper's pose, a mode `dP` changes the pose that the images show by
+/// `xi = -J^+ dP x`. `None` where the images do not determine the pose.
 fn pose_by_modes(rim: &Rim, p: &[Projection; 2], rig: &RigError) -> Option<Vec<SVector<f64, 6>>> {
     let f = frame_of(&rim.normal);
     let marks: Vec<Vector3<f64>> = (0..MARKS)
         .map(|k| {
             let (sin, cos) = (std::f64::consts::TAU * k as f64 / MARKS as f64).sin_cos();
-            // Not all at one height, as on a real gripper.
-            let before = MARKS_BEFORE_M * if k % 2 == 0 { 1.0 } else { 0.75 };
-            rim.centre + (f.column(0) * cos + f.column(1) * sin) * MARKS_ASIDE_M + rim.normal * before
+            // Not coplanar, as on a real gripper.
+            let before = MARK_HEIGHT_M * if k % 2 == 0 { 1.0 } else { 0.75 };
+            rim.centre + (f.column(0) * cos + f.column(1) * sin) * MARK_RADIUS_M + rim.normal * before
         })
         .collect();
     let mut normal = SMatrix::<f64, 6, 6>::zeros();
@@ -144,13 +147,13 @@ fn pose_by_modes(rim: &Rim, p: &[Projection; 2], rig: &RigError) -> Option<Vec<S
 }
 
 /// Standard deviations of centre and normal *as the loop reaches them*: of the rim relative to a gripper whose marks
-/// are at their predicted places in both images. A rig error moves rim and marks alike; what remains is the
+/// are at their predicted positions in both images. A rig error displaces rim and marks alike; what remains is the
 /// covariance of `delta - xi phi`.
 fn in_images(fitted: &Fitted, rim: &Rim, rig: &RigError) -> (f64, f64) {
     let p = [0, 1].map(|k| corrected(rig, &fitted.phi, k));
     let Some(motion) = pose_by_modes(rim, &p, rig) else { return (f64::INFINITY, f64::INFINITY) };
     let f = frame_of(&rim.normal);
-    // Rows: centre, and the normal's part along the plane's axes; a turn w moves the normal by w x n.
+    // Rows: centre, and the normal's components along the plane's axes. A rotation w moves the normal by w x n.
     let mut a = DMatrix::<f64>::zeros(5, fitted.cov.ncols());
     for k in 0..5 {
         a[(k, k)] = 1.0;
@@ -168,9 +171,9 @@ fn in_images(fitted: &Fitted, rim: &Rim, rig: &RigError) -> (f64, f64) {
     ((cov[(0, 0)] + cov[(1, 1)] + cov[(2, 2)]).sqrt(), (cov[(3, 3)] + cov[(4, 4)]).sqrt())
 }
 
-/// By how much two models of the same contours lead to different grasps: distance of the centres and angle of the
-/// normals, as the loop reaches them.
-pub(in crate::offline) fn apart(a: &Fitted, b: &Fitted, rig: &RigError) -> (f64, f64) {
+/// Difference between the grasps of two models of the same contours: distance of the centres and angle of the normals,
+/// as the loop reaches them.
+pub(in crate::offline) fn grasp_difference(a: &Fitted, b: &Fitted, rig: &RigError) -> (f64, f64) {
     let (Some(s), Some(t)) = (a.shapes.first(), b.shapes.first()) else { return (f64::INFINITY, f64::INFINITY) };
     let (_, rim, _) = rim_of(s);
     let (_, other, _) = rim_of(t);
@@ -183,7 +186,7 @@ pub(in crate::offline) fn apart(a: &Fitted, b: &Fitted, rig: &RigError) -> (f64,
     (centre.norm(), normal.norm())
 }
 
-/// Kind, rim and bar radius of a shape; for a bar the rim is its core circle.
+/// Model, rim and bar radius of a shape; for a bar the rim is its core circle.
 fn rim_of(shape: &Shape) -> (RimModel, Rim, Option<f64>) {
     match shape {
         Shape::Circle(r) => (RimModel::Circle, *r, None),

@@ -1,26 +1,26 @@
-//! Edge points linked to chains, and chains cut into arcs that could belong to one ellipse.
+//! Edge points linked into chains, and chains cut into arcs that may belong to one ellipse.
 
 use crate::offline::edges::lens::Lens;
 use crate::offline::edges::{Edge, EdgeMap};
 use graspd_rt::geom::Pixel;
 use std::cell::Cell;
 
-/// Arcs shorter than this say nothing.
-const SHORTEST: usize = 8;
+/// Shortest arc that is kept, edge points.
+const MIN_EDGES: usize = 8;
 
-/// A run of linked edge points that turns one way without corners.
+/// A run of linked edge points that turns in one direction without corners.
 #[derive(Clone, Debug)]
 pub struct Arc {
-    /// Indices into the edge map, in order, brighter side always on the same hand.
+    /// Indices into the edge map, in order along the arc, with the brighter side always on the same side.
     pub edges: Vec<u32>,
-    /// How far it turns from end to end, radians, signed.
+    /// Total turn from end to end, radians, signed.
     pub turn: f64,
 }
 
 /// An edge point in ideal pixels.
 #[derive(Clone, Copy, Debug)]
 pub struct IdealEdge {
-    /// Place with the lens distortion removed.
+    /// Position with the lens distortion removed.
     pub at: Pixel,
     /// Unit gradient there, towards the brighter side.
     pub towards_bright: Pixel,
@@ -31,20 +31,20 @@ pub struct IdealEdge {
 pub struct Arcs {
     /// All arcs, in raster order of their first point.
     pub arcs: Vec<Arc>,
-    /// Arc of each edge point, as index + 1; 0 for none.
+    /// Arc of each edge point as index + 1; 0 for points in no arc.
     arc_of: Vec<u32>,
-    /// Every edge point in ideal pixels; points where the lens has no inverse stand at NaN.
+    /// All edge points in ideal pixels; NaN where the distortion model has no inverse.
     pub ideal: IdealEdges,
 }
 
-/// The edge points of an image in ideal pixels. Most are never asked for, so each is undistorted when it is for the first time.
+/// The edge points of an image in ideal pixels. Most are never used, so that each is undistorted on first access.
 #[derive(Clone, Debug)]
 pub struct IdealEdges {
     lens: Lens,
     edges: Vec<Cell<Undistorted>>,
 }
 
-/// An edge point before and after.
+/// State of an edge point: raw, or undistorted.
 #[derive(Clone, Copy, Debug)]
 enum Undistorted {
     NotYet(IdealEdge),
@@ -74,7 +74,7 @@ impl IdealEdges {
 }
 
 impl Arcs {
-    /// Links and cuts the edge points of an image.
+    /// Links the edge points of an image and cuts the chains into arcs.
     pub fn link(map: &EdgeMap, lens: &Lens) -> Self {
         let (next, previous) = links(map);
         let n = map.edges().len();
@@ -86,7 +86,7 @@ impl Arcs {
             if done.get(start as usize).copied().unwrap_or(true) {
                 continue;
             }
-            // Back to the chain's beginning, or once round.
+            // Walk back to the start of the chain, or once around a closed one.
             let mut first = start;
             for _ in 0..n {
                 match get(&previous, first) {
@@ -118,10 +118,10 @@ impl Arcs {
         }
     }
 
-    /// Cuts a chain at corners and inflections and keeps what is long enough.
+    /// Cuts a chain at corners and inflections, and keeps the pieces that are long enough.
     fn cut(&mut self, map: &EdgeMap, chain: &[u32]) {
         const W: usize = 5;
-        if chain.len() < SHORTEST {
+        if chain.len() < MIN_EDGES {
             return;
         }
         let dir: Vec<Pixel> =
@@ -137,7 +137,7 @@ impl Arcs {
             let corner = t.abs() > 1.1;
             let flips = t.abs() > 0.12 && sense * t < 0.0;
             if corner || flips {
-                // An inflection lies between the last place that turned the old way and here.
+                // The inflection lies between here and the last point that turned in the other direction.
                 let end = if corner { k } else { (since + k) / 2 };
                 self.keep(map, chain.get(from..end).unwrap_or(&[]));
                 from = if corner { k + 1 } else { end };
@@ -152,7 +152,7 @@ impl Arcs {
     }
 
     fn keep(&mut self, map: &EdgeMap, piece: &[u32]) {
-        if piece.len() < SHORTEST {
+        if piece.len() < MIN_EDGES {
             return;
         }
         let dirs = piece.iter().filter_map(|k| map.edges().get(*k as usize)).map(|e| e.towards_bright);
@@ -176,7 +176,7 @@ impl Arcs {
 
 const NONE: u32 = u32::MAX;
 
-/// Next and previous edge point of each, where the choice is mutual.
+/// Next and previous edge point of each point, where the choice is mutual.
 fn links(map: &EdgeMap) -> (Vec<u32>, Vec<u32>) {
     let n = map.edges().len();
     let (mut ahead, mut behind) = (vec![NONE; n], vec![NONE; n]);
@@ -220,7 +220,7 @@ mod tests {
     use graspd_rt::geom::{Camera, Distortion};
 
     #[test]
-    fn a_disc_gives_one_arc_all_round_and_a_square_four() {
+    fn a_disc_gives_one_closed_arc_and_a_square_four() {
         let cam = Camera {
             width: 160,
             height: 160,

@@ -1,17 +1,22 @@
 //! The gradient of a smoothed image, row by row.
 //!
-//! Whole images of intermediate results would be tens of megabytes that are touched once: clearing and faulting in their pages costs more than the
-//! arithmetic. So only the rows that a row's neighbourhood needs are kept, and they stay in the cache.
+//! Whole images of intermediate results would be tens of megabytes that are touched once: clearing them and faulting
+//! in their pages costs more than the arithmetic. Only the rows that the neighbourhood of one row needs are kept, and
+//! they stay in the cache.
 
 use crate::offline::edges::grey_image::GreyImage;
-use crate::offline::edges::{RADIUS, SCALE};
 
+/// Standard deviation of the Gaussian whose derivatives are taken, pixels.
+pub const SCALE: f64 = 1.0;
+/// Radius of the sampled kernel, pixels.
+pub(super) const RADIUS: usize = 4;
 /// Samples of a kernel.
 const TAPS: usize = 2 * RADIUS + 1;
-/// Pixels that are worked on together: their sums stay in registers.
+/// Pixels processed together: their sums stay in registers.
 const LANES: usize = 16;
 
-/// First derivatives of the smoothed image along one row, from column [`RADIUS`] on; nearer to the border there are none.
+/// First derivatives of the smoothed image along one row, starting at column [`RADIUS`]. Columns closer to the border
+/// have none.
 #[derive(Clone, Debug, Default)]
 pub(super) struct GradientRow {
     pub(super) x: Vec<f32>,
@@ -20,25 +25,25 @@ pub(super) struct GradientRow {
     pub(super) square: Vec<f32>,
 }
 
-/// Walks down an image.
+/// Iterates over the rows of an image from top to bottom.
 pub(super) struct GradientRows<'a> {
     image: &'a GreyImage,
     smooth: [f32; TAPS],
     slope: [f32; TAPS],
-    /// Grey values of a row, with room for the last lanes.
+    /// Grey values of a row, padded to whole lanes.
     grey: Vec<f32>,
-    /// The last rows smoothed and derived along x; row `y` at `y % TAPS`.
+    /// The last rows, smoothed and differentiated along x; row `y` at `y % TAPS`.
     across: [(Vec<f32>, Vec<f32>); TAPS],
-    /// How many rows of the image have been taken.
+    /// Number of image rows processed.
     taken: usize,
     /// The last three gradient rows; row `y` at `y % 3`.
     rows: [GradientRow; 3],
-    /// Row whose gradient comes out next.
+    /// Row whose gradient is returned next.
     next: usize,
 }
 
 impl<'a> GradientRows<'a> {
-    /// `None` where the image is too small to have any.
+    /// `None` when the image is smaller than the kernel.
     pub(super) fn new(image: &'a GreyImage) -> Option<Self> {
         let (w, h) = (image.width(), image.height());
         if w < TAPS + 2 || h < TAPS + 2 {
@@ -59,18 +64,18 @@ impl<'a> GradientRows<'a> {
             rows: [row(), row(), row()],
             next: RADIUS,
         };
-        rows.make(RADIUS);
+        rows.compute(RADIUS);
         Some(rows)
     }
 
-    /// The next row's number with the gradient above, in, and below it. Rows beyond the last are zero, like those before the first.
+    /// The next row's number with the gradient above, in, and below it. Rows outside the image's interior are zero.
     pub(super) fn step(&mut self) -> Option<(usize, [&GradientRow; 3])> {
         let y = self.next;
         if y + RADIUS >= self.image.height() {
             return None;
         }
         self.next += 1;
-        self.make(y + 1);
+        self.compute(y + 1);
         let [a, b, c] = &self.rows;
         Some((
             y,
@@ -83,7 +88,7 @@ impl<'a> GradientRows<'a> {
     }
 
     /// Computes the gradient of row `y` into its slot.
-    fn make(&mut self, y: usize) {
+    fn compute(&mut self, y: usize) {
         let Some(out) = self.rows.get_mut(y % 3) else { return };
         if y + RADIUS >= self.image.height() {
             out.square.fill(0.0);
@@ -136,7 +141,8 @@ fn down(rows: [&[f32]; TAPS], kernel: &[f32; TAPS], out: &mut [f32]) {
     }
 }
 
-/// A Gaussian and its derivative: a constant stays what it is, and a ramp of one grey level a pixel has slope exactly one.
+/// A Gaussian and its derivative, scaled so that a constant is preserved and a ramp of one grey level per pixel has
+/// slope exactly one.
 fn kernels() -> ([f32; TAPS], [f32; TAPS]) {
     let (mut smooth, mut slope) = ([0f32; TAPS], [0f32; TAPS]);
     let mut sum = 0.0;

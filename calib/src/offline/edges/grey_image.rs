@@ -1,11 +1,11 @@
-//! A grey image, from a file or from a live frame, and how noisy it is.
+//! An 8-bit grey image from a file or a live frame, and the estimate of its noise.
 
 use crate::files::{ContentHash, FileError};
 use graspd_rt::geom::Pixel;
 use graspd_rt::image::ImageView;
 use std::path::Path;
 
-/// An owned grey image of eight bits a pixel, rows without padding.
+/// An owned grey image with 8 bits per pixel and no row padding.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GreyImage {
     width: usize,
@@ -14,19 +14,23 @@ pub struct GreyImage {
 }
 
 impl GreyImage {
-    /// An image from its grey values, row by row; `None` when their number is not `width * height` or a side is zero or absurd.
+    /// An image from its grey values, row by row. `None` when there are not `width * height` values, or when
+    /// [`ImageView`] rejects the size.
     pub fn new(width: usize, height: usize, data: Vec<u8>) -> Option<Self> {
         (data.len() == width.checked_mul(height)? && ImageView::new(&data, width, height, width).is_some())
             .then_some(Self { width, height, data })
     }
 
-    /// A copy of a live frame's view.
+    /// Copies a view of a live frame.
     pub fn copy_of(view: &ImageView<'_>) -> Self {
         let data = (0..view.height()).flat_map(|y| view.row(y)).copied().collect();
         Self { width: view.width(), height: view.height(), data }
     }
 
-    /// Reads a PNG, JPEG or PGM file; colour is turned to grey (Rec. 709 luma), 16 bits to 8.
+    /// Reads a PNG, JPEG or PGM file. Colour is converted to grey (Rec. 709 luma), 16 bits to 8.
+    ///
+    /// # Errors
+    /// [`FileError::Read`] when the file cannot be read or decoded, or has a size that no camera has.
     pub fn load(path: &Path) -> Result<Self, FileError> {
         let refuse = |reason: String| FileError::Read {
             path: path.display().to_string(),
@@ -39,8 +43,7 @@ impl GreyImage {
             .map_err(|e| refuse(e.to_string()))?;
         let grey = reader.decode().map_err(|e| refuse(e.to_string()))?.into_luma8();
         let (w, h) = (grey.width() as usize, grey.height() as usize);
-        Self::new(w, h, grey.into_raw())
-            .ok_or_else(|| refuse(format!("its size {w}x{h} is not that of a camera image")))
+        Self::new(w, h, grey.into_raw()).ok_or_else(|| refuse(format!("image size {w}x{h} is not that of a camera")))
     }
 
     /// Width, pixels.
@@ -63,7 +66,7 @@ impl GreyImage {
         self.data.get(y * self.width..(y + 1) * self.width).unwrap_or(&[])
     }
 
-    /// Borrows it as the on-line stage's type.
+    /// Borrows the image as the type that the on-line stage uses.
     pub fn view(&self) -> Option<ImageView<'_>> {
         ImageView::new(&self.data, self.width, self.height, self.width)
     }
@@ -73,7 +76,7 @@ impl GreyImage {
         ContentHash::of(&self.data)
     }
 
-    /// Whether a pixel lies in the image by at least `margin`.
+    /// Whether a pixel is at least `margin` pixels inside the image.
     pub fn contains(&self, p: Pixel, margin: f64) -> bool {
         p.x >= margin
             && p.y >= margin
@@ -81,8 +84,9 @@ impl GreyImage {
             && p.y <= self.height as f64 - 1.0 - margin
     }
 
-    /// Standard deviation of the pixel noise in grey levels, from the median response to a mask that no plane or ramp excites
-    /// (Immerkaer 1996, made robust against edges by the median). Never below the rounding to whole grey levels.
+    /// Standard deviation of the pixel noise, grey levels: from the median response to a mask whose response to a
+    /// plane is zero (Immerkaer 1996, made robust against edges by the median). Never below the standard deviation of
+    /// rounding to whole grey levels.
     pub fn noise(&self) -> f64 {
         let mut counts = [0u32; 4096];
         let mut total = 0u32;
@@ -90,7 +94,7 @@ impl GreyImage {
             let (a, b, c) = (self.row(y - 1), self.row(y), self.row(y + 1));
             for ((p, q), r) in a.windows(3).zip(b.windows(3)).zip(c.windows(3)).step_by(2) {
                 if let ([p0, p1, p2], [q0, q1, q2], [r0, r1, r2]) = (p, q, r) {
-                    // Saturated pixels carry no noise and would hide that of the others.
+                    // Saturated pixels have no noise and would bias the estimate low.
                     if *q1 == 0 || *q1 == 255 {
                         continue;
                     }
@@ -108,7 +112,7 @@ impl GreyImage {
         for (k, n) in counts.iter().enumerate() {
             sum += n;
             if 2 * sum >= total.max(1) {
-                // Within the bin, as if its values were spread evenly over it.
+                // Interpolated within the bin, as if its values were spread evenly over it.
                 median = k as f64 + 0.5 - (f64::from(sum) - 0.5 * f64::from(total)) / f64::from((*n).max(1));
                 break;
             }
@@ -124,7 +128,7 @@ mod tests {
     use rand_distr::{Distribution, Normal};
 
     #[test]
-    fn noise_is_measured_on_a_image_with_edges() {
+    fn noise_is_estimated_on_an_image_with_edges() {
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(3);
         for sigma in [1.0, 2.5, 6.0] {
             let n = Normal::new(0.0, sigma).unwrap();
@@ -141,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wrong_size_is_no_image() {
+    fn a_size_mismatch_is_refused() {
         assert!(GreyImage::new(3, 3, vec![0; 8]).is_none());
         assert!(GreyImage::new(0, 3, vec![]).is_none());
         let e = GreyImage::load(Path::new("no/such.png")).unwrap_err().to_string();

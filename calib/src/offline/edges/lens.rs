@@ -1,10 +1,10 @@
-//! Between the pixels of an image and those of the ideal pinhole in which conics are conics.
+//! Conversion between raw image pixels and the ideal pixels of a pinhole, in which the images of conics are conics.
 
-use crate::offline::rim::model::Projection;
+use crate::offline::types::projection::Projection;
 use graspd_rt::geom::{Camera, Distortion, Pixel, Rig, View};
 use nalgebra::{Matrix3, Matrix3x4};
 
-/// A camera as the map between *raw* pixels (where the image has them) and *ideal* ones (same focal lengths, no distortion).
+/// A camera as the map between *raw* pixels (as in the image) and *ideal* pixels (same focal lengths, no distortion).
 #[derive(Clone, Copy, Debug)]
 pub struct Lens {
     camera: Camera,
@@ -17,7 +17,7 @@ impl Lens {
         Self { camera: *camera, straight: camera.distortion == Distortion::default() }
     }
 
-    /// Ideal pixel of a raw one; `None` where the model has no inverse.
+    /// Ideal pixel of a raw one; `None` where the distortion model has no inverse.
     pub fn ideal(&self, raw: Pixel) -> Option<Pixel> {
         if self.straight {
             return Some(raw);
@@ -35,18 +35,18 @@ impl Lens {
         c.distort(Pixel::new((ideal.x - c.cx) / c.fx, (ideal.y - c.cy) / c.fy))
     }
 
-    /// Ideal direction of a raw direction at a raw place whose ideal place is known.
+    /// Ideal direction of a raw direction at a raw position whose ideal position is known.
     pub fn ideal_direction(&self, raw: Pixel, ideal: Pixel, direction: Pixel) -> Pixel {
         if self.straight {
             return direction;
         }
-        // A short step both ways; the lens is smooth at that scale.
+        // By finite differences: the lens is smooth on the scale of half a pixel.
         let step = self.ideal(raw + direction * 0.5).unwrap_or(ideal + direction * 0.5) - ideal;
         step.try_normalize(1e-9).unwrap_or(direction)
     }
 }
 
-/// Projection matrix of a view for ideal pixels and points of the left camera's frame, metres.
+/// Projection matrix of a view: ideal pixels from points of the left camera's frame, metres.
 pub fn projection(rig: &Rig, view: View) -> Projection {
     let c = rig.camera(view);
     let k = Matrix3::new(c.fx, 0.0, c.cx, 0.0, c.fy, c.cy, 0.0, 0.0, 1.0);

@@ -1,7 +1,7 @@
 //! Mark visibility as solid angle (section 3.2, errata D). Knows neither units nor cameras' distortion: lengths as the matrices have them.
 
-use crate::offline::rim::cone::{camera_centre, project};
-use crate::offline::rim::model::Projection;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::{camera_centre, project};
 use nalgebra::{Isometry3, Point3, Vector2, Vector3};
 
 /// A small flat mark: position and outward unit normal in the gripper frame, and area.
@@ -64,7 +64,7 @@ pub fn seen(x: &Vector3<f64>, normal: &Vector3<f64>, eye: &Eye) -> bool {
     let v = (eye.centre - x).normalize();
     let u: Vector2<f64> = project(&eye.p, x);
     v.dot(normal) >= MIN_COSINE
-        && crate::offline::rim::cone::depth(&eye.p, x) > 0.0
+        && crate::offline::types::projection::depth(&eye.p, x) > 0.0
         && u.x >= BORDER_PX
         && u.y >= BORDER_PX
         && u.x <= eye.size[0] - 1.0 - BORDER_PX

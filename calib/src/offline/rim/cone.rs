@@ -1,60 +1,19 @@
-//! The projective cone of an image's conic, `Q = P^T C P` (section 4.1), in a frame in which its numbers mean something.
+//! The projective cone of an image's conic, `Q = P^T C P` (section 4.1), in a normalised frame.
 //!
-//! Errata B8: with the image centred on the ellipse and the world centred on the rim with the rim's size as unit, both cones are about
-//! `x^2 + y^2 - 1` and the residues of the pencil are comparable between scenes.
+//! The image is centred on the ellipse, and the world on the rim with the rim's size as unit. Both cones are then
+//! close to `x^2 + y^2 - 1`, and the residues of the pencil are comparable between scenes.
 
 use crate::offline::conic::{ellipse_of, orient};
-use crate::offline::rim::model::{Ellipse2, Projection};
 use crate::offline::rim::refusal::Refusal;
+use crate::offline::types::Ellipse2;
+use crate::offline::types::projection::{Projection, camera_centre, depth, focal_length, ray};
 use graspd_rt::geom::View;
 use nalgebra::{Matrix3, Matrix4, SMatrix, Vector3, Vector4};
 
-/// Projection centre of a finite camera, the kernel of `P` with last coordinate 1; `None` when the left block is singular.
-pub fn camera_centre(p: &Projection) -> Option<Vector3<f64>> {
-    let m = p.fixed_view::<3, 3>(0, 0).into_owned();
-    let scale = m.norm();
-    let det = m.determinant();
-    if !(det.abs() > 1e-14 * scale * scale * scale) {
-        return None;
-    }
-    let c = -(m.try_inverse()? * p.column(3));
-    c.iter().all(|v| v.is_finite()).then_some(c)
-}
-
-/// Depth of a point along a camera's axis, positive in front, in length units whatever the scale and sign of `P`.
-pub fn depth(p: &Projection, x: &Vector3<f64>) -> f64 {
-    let m = p.fixed_view::<3, 3>(0, 0).into_owned();
-    let w = p[(2, 0)] * x.x + p[(2, 1)] * x.y + p[(2, 2)] * x.z + p[(2, 3)];
-    w * m.determinant().signum() / third_row(p).norm()
-}
-
-/// The third row's direction part.
-pub fn third_row(p: &Projection) -> Vector3<f64> {
-    Vector3::new(p[(2, 0)], p[(2, 1)], p[(2, 2)])
-}
-
-/// Pixel of a point; not finite on the camera's focal plane.
-pub fn project(p: &Projection, x: &Vector3<f64>) -> nalgebra::Vector2<f64> {
-    let h = p * Vector4::new(x.x, x.y, x.z, 1.0);
-    nalgebra::Vector2::new(h.x / h.z, h.y / h.z)
-}
-
-/// Unit viewing ray of a pixel, pointing to the front.
-pub fn ray(p: &Projection, u: f64, v: f64) -> Option<Vector3<f64>> {
-    let m = p.fixed_view::<3, 3>(0, 0).into_owned();
-    let d = (m.try_inverse()? * Vector3::new(u, v, 1.0)).normalize();
-    let front = third_row(p).dot(&d) * m.determinant();
-    d.iter().all(|x| x.is_finite()).then_some(if front < 0.0 { -d } else { d })
-}
-
-/// Focal length along u in pixels, skew and scale of `P` taken out.
-pub fn focal_length(p: &Projection) -> f64 {
-    let first = Vector3::new(p[(0, 0)], p[(0, 1)], p[(0, 2)]);
-    let third = third_row(p);
-    first.cross(&third).norm() / third.norm_squared()
-}
-
-/// Checks a pair of cameras: finite entries, finite centres, a baseline.
+/// Checks a pair of cameras: finite entries, finite centres, a baseline. Returns both centres.
+///
+/// # Errors
+/// [`Refusal::BadInput`], [`Refusal::Camera`] or [`Refusal::NoBaseline`].
 pub fn check_cameras(left: &Projection, right: &Projection) -> Result<[Vector3<f64>; 2], Refusal> {
     for (view, p) in [(View::Left, left), (View::Right, right)] {
         if p.iter().any(|v| !v.is_finite()) {
@@ -67,7 +26,7 @@ pub fn check_cameras(left: &Projection, right: &Projection) -> Result<[Vector3<f
     let (Some(o), Some(q)) = (camera_centre(left), camera_centre(right)) else {
         return Err(Refusal::Camera { view: View::Left });
     };
-    // Far from the origin the centres themselves carry rounding, hence the relative term.
+    // Far from the origin the centres themselves are rounded, hence the relative term.
     if !((o - q).norm() > 1e-9 * (o.norm() + q.norm()) + f64::MIN_POSITIVE) {
         return Err(Refusal::NoBaseline);
     }
@@ -91,6 +50,9 @@ pub struct ConePair {
 
 impl ConePair {
     /// Builds both cones from the images' conics.
+    ///
+    /// # Errors
+    /// A [`Refusal`] when the cameras or conics are degenerate, or the rays of the ellipses' centres are parallel.
     pub fn new(c: [&Matrix3<f64>; 2], p: [&Projection; 2]) -> Result<Self, Refusal> {
         let o = check_cameras(p[0], p[1])?;
         let e = ellipses(c)?;
@@ -169,7 +131,7 @@ pub(crate) fn complement(a: &Vector4<f64>, b: &Vector4<f64>) -> Option<SMatrix<f
     let v = (b - u * u.dot(b)).normalize();
     let mut basis = [u, v, Vector4::zeros(), Vector4::zeros()];
     for k in 2..4 {
-        // The unit vector that the basis explains least is the safest to orthogonalise.
+        // The unit vector with the largest component outside the basis is the safest to orthogonalise.
         let best = (0..4)
             .map(|i| Vector4::ith(i, 1.0))
             .map(|e| basis[..k].iter().fold(e, |r, q| r - q * q.dot(&e)))

@@ -1,19 +1,20 @@
 //! The maximum-likelihood circle or ellipse over both views' edge points, with its covariance.
 //!
-//! Minimises the sum of squared Sampson distances in both images over the rim in space: 6 parameters for a circle, 8 for an ellipse.
-//! The chart is local: centre and shape in units of the rim's size, the normal turned about the plane's own axes, so that neither a
-//! circle (equal axes) nor any direction of the normal is a singular point.
+//! Minimises the sum of squared Sampson distances in both images over the rim in space: 6 parameters for a circle, 8
+//! for an ellipse. The chart is local: centre and shape in units of the rim's size, the normal rotated about the
+//! plane's own axes, so that neither a circle (equal axes) nor any direction of the normal is a singular point.
 
 use crate::offline::conic::eigen;
 use crate::offline::conic::levenberg::{self, Linear, Problem};
 use crate::offline::conic::sampson::{Cloud, coefficients};
 use crate::offline::conic::{conic_derivative, image_of_unit_circle, orient};
 use crate::offline::rim::circle::{frame_of, signed_axis};
-use crate::offline::rim::model::{Projection, Rim, RimModel};
+use crate::offline::rim::model::{Rim, RimModel};
 use crate::offline::rim::refusal::Refusal;
+use crate::offline::types::projection::Projection;
 use nalgebra::{Matrix2, Matrix3, Matrix3x2, Matrix4, SMatrix, SVector, Vector2, Vector3};
 
-/// Edge points of both views ready for fitting, with their cameras.
+/// Edge points of both views prepared for fitting, with their cameras.
 #[derive(Clone, Debug)]
 pub struct TwoViews {
     clouds: [Cloud; 2],
@@ -25,7 +26,7 @@ pub struct TwoViews {
 pub struct MlFit {
     /// The rim; for the circle model `a = b`.
     pub rim: Rim,
-    /// Which of the two.
+    /// Circle or ellipse.
     pub model: RimModel,
     /// Weighted sum of squared residuals.
     pub chi2: f64,
@@ -33,8 +34,8 @@ pub struct MlFit {
     pub count: usize,
     /// Number of parameters: 6 or 8.
     pub parameters: usize,
-    /// Inverse normal matrix (times the noise variance: the covariance) of centre (length), normal (radians, columns `e1, e2` of
-    /// [`frame_of`] the normal) and shape: the radius, or `S00, S01, S11` (length) in axes `e1, e2`.
+    /// Inverse normal matrix (times the noise variance: the covariance) of centre (length), normal (radians, columns
+    /// `e1, e2` of [`frame_of`] the normal) and shape: the radius, or `S00, S01, S11` (length) in axes `e1, e2`.
     pub cofactor: SMatrix<f64, 8, 8>,
     /// Rows of the derivative of `(a, b)` by the shape's entries.
     axes_from_shape: SMatrix<f64, 2, 3>,
@@ -77,7 +78,7 @@ impl MlFit {
 }
 
 impl TwoViews {
-    /// Takes both views' points in frames of order one.
+    /// Both views' points, each in a frame of order one.
     pub fn new(clouds: [Cloud; 2], p: [&Projection; 2]) -> Self {
         Self { clouds, p: p.map(|p| *p) }
     }
@@ -92,7 +93,10 @@ impl TwoViews {
         self.len() == 0
     }
 
-    /// Fits a circle or an ellipse from a start; any start whose image overlaps the points will do.
+    /// Fits a circle or an ellipse from a start whose image overlaps the points.
+    ///
+    /// # Errors
+    /// [`Refusal::NoFit`] when there are too few points, or the fit does not converge.
     pub fn fit(&self, start: &Rim, model: RimModel) -> Result<MlFit, Refusal> {
         let problem = RimProblem::new(self, start, model);
         let state = problem.start(start);
@@ -103,12 +107,16 @@ impl TwoViews {
         let minimum =
             levenberg::minimise(&problem, state, 60).ok_or(Refusal::NoFit { why: "the residuals are not finite" })?;
         if !minimum.converged {
-            return Err(Refusal::NoFit { why: "the iteration did not settle" });
+            return Err(Refusal::NoFit { why: "the iteration limit was reached" });
         }
         problem.result(&minimum.state, minimum.cost, &minimum.normal)
     }
 
-    /// The normal matrix of the chart at a given rim, inverted: the Cramer-Rao bound for unit noise when `rim` is the truth.
+    /// The inverse normal matrix of the chart at a given rim: the Cramer-Rao bound for unit noise when `rim` is the
+    /// truth.
+    ///
+    /// # Errors
+    /// [`Refusal::NoFit`] when the points do not determine the rim.
     pub fn information(&self, rim: &Rim, model: RimModel) -> Result<MlFit, Refusal> {
         let problem = RimProblem::new(self, rim, model);
         let state = problem.start(rim);
@@ -125,7 +133,7 @@ pub fn image_conic(p: &Projection, rim: &Rim) -> Matrix3<f64> {
     orient(&image_of_unit_circle(&(h / h.norm())))
 }
 
-/// The fit as a least-squares problem in the frame of the start.
+/// The least-squares problem, in the frame of the start.
 struct RimProblem<'a> {
     views: &'a TwoViews,
     /// Cameras from the rim's frame to each cloud's frame.
@@ -192,7 +200,7 @@ impl<'a> RimProblem<'a> {
             centre(0),
             centre(1),
             centre(2),
-            // Turning the normal by alpha towards e1 moves e1 by -alpha n.
+            // Rotating the normal by alpha towards e1 moves e1 by -alpha n.
             Matrix3::from_columns(&[-w * x.s[(0, 0)], -w * x.s[(0, 1)], zero]),
             Matrix3::from_columns(&[-w * x.s[(1, 0)], -w * x.s[(1, 1)], zero]),
             Matrix3::from_columns(&[u, zero, zero]),
@@ -294,7 +302,7 @@ impl Problem<8> for RimProblem<'_> {
     }
 
     fn cost(&self, x: &State) -> Option<f64> {
-        // A shape that has turned inside out is the same image with a wrong name.
+        // A shape with a negative axis has the same image but is not a valid state.
         if !(x.s.determinant() > 0.0 && x.s[(0, 0)] > 0.0) {
             return None;
         }
@@ -321,8 +329,8 @@ impl Problem<8> for RimProblem<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::offline::rim::model::{EdgePoint, Scatter};
     use crate::offline::rim::synthetic::{rig, rim_points, rim_tilted};
+    use crate::offline::types::{EdgePoint, Scatter};
 
     fn views(noise: f64) -> (TwoViews, Rim) {
         let rim = rim_tilted(Vector3::new(0.03, -0.04, 1.5), 0.6, 1.1, 0.075, 0.06);

@@ -1,53 +1,19 @@
-//! The values that go into and come out of a reconstruction: edge points, rim models, options, result and report.
+//! The values of a reconstruction: rim models, options, result and report. Edge points are in
+//! [`crate::offline::types`].
 //!
-//! The entry is [`crate::offline::rim::reconstruct::reconstruct`]:
+//! The entry is [`crate::offline::decide::reconstruct::reconstruct`]:
 //!
 //! ```text
 //! fn reconstruct(left: &[EdgePoint], p_left: &Projection, right: &[EdgePoint], p_right: &Projection, options: &Options)
 //!     -> Result<Reconstruction, Refusal>
 //! ```
 //!
-//! Lengths are in whatever unit the projection matrices use (metres in graspd, millimetres in the golden cases).
+//! Lengths are in the unit of the projection matrices (metres in graspd, millimetres in the golden cases).
 
-use nalgebra::{Matrix2, Matrix3, Matrix3x2, Matrix3x4, Vector2, Vector3};
+use crate::offline::types::{Ellipse2, Scatter};
+use nalgebra::{Matrix2, Matrix3, Matrix3x2, Vector3};
 
-/// A finite camera, `u = P x` (paper equation 1): pixels free of distortion from homogeneous points. Scale and sign do not matter.
-pub type Projection = Matrix3x4<f64>;
-
-/// Which outline of a rim an edge point belongs to.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
-pub enum Outline {
-    /// The only outline of a sharp or painted edge, or the outer one of a bar.
-    #[default]
-    Outer,
-    /// The inner outline of a round bar.
-    Inner,
-}
-
-/// An edge point: pixels of an ideal pinhole (distortion removed) and its standard deviation across the edge.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct EdgePoint {
-    /// Undistorted pixel.
-    pub uv: Vector2<f64>,
-    /// Standard deviation across the edge, pixels. Only the ratios matter unless [`Noise::AtLeastGiven`] is chosen.
-    pub sigma: f64,
-    /// The outline it lies on.
-    pub outline: Outline,
-}
-
-impl EdgePoint {
-    /// A point on the (outer) outline.
-    pub fn new(u: f64, v: f64, sigma: f64) -> Self {
-        Self { uv: Vector2::new(u, v), sigma, outline: Outline::Outer }
-    }
-
-    /// A point on the inner outline of a round bar.
-    pub fn inner(u: f64, v: f64, sigma: f64) -> Self {
-        Self { uv: Vector2::new(u, v), sigma, outline: Outline::Inner }
-    }
-}
-
-/// What the rim is.
+/// The model of a rim.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum RimModel {
     /// A sharp or painted circle (6 parameters).
@@ -58,7 +24,7 @@ pub enum RimModel {
     RoundBar,
 }
 
-/// What the operator says that the rim is.
+/// The kind of rim that the operator specifies.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum RimChoice {
     /// A plane edge: circle or ellipse by the information criterion.
@@ -69,58 +35,51 @@ pub enum RimChoice {
     Ellipse,
     /// A round bar.
     RoundBar,
-    /// Anything: the smallest information criterion decides.
+    /// Any: the smallest information criterion decides.
     #[default]
     Auto,
 }
 
-/// Where the absolute scale of the noise comes from.
+/// Source of the absolute scale of the noise.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Noise {
     /// From the residuals of the fit alone; `EdgePoint::sigma` gives relative weights.
     #[default]
     FromFit,
-    /// From the residuals, but never below what `EdgePoint::sigma` says.
+    /// From the residuals, but not below the given `EdgePoint::sigma`.
     AtLeastGiven,
 }
 
-/// In which direction edge points scatter about the contour. The difference is `kappa sigma^2 / 2`, below 0.003 px on ordinary edges.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
-pub enum Scatter {
-    /// Equally in all directions: first-order distances have no bias.
-    #[default]
-    Isotropic,
-    /// Across the edge only, as an edge detector's sub-pixel step along the gradient does: orthogonal distances have no bias.
-    Across,
-}
-
-/// What to assume and what to tolerate.
+/// Assumptions and tolerances of a reconstruction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Options {
     /// The rim's kind.
     pub rim: RimChoice,
-    /// The bar's diameter when the operator knows it, length units. Makes the outer outlines alone enough for a round bar.
+    /// The bar's diameter if the operator knows it, length units. With it the outer outlines alone determine a round
+    /// bar.
     pub bar_diameter: Option<f64>,
     /// Scale of the noise.
     pub noise: Noise,
     /// Direction of the noise.
     pub scatter: Scatter,
-    /// Whether to look for gross outliers: consensus in each view, then a redescending loss over both.
+    /// Whether to reject gross outliers: consensus in each view, then a redescending loss over both.
     pub robust: bool,
     /// The gate of the two-view test, in standard deviations.
     pub gate_sigmas: f64,
-    /// Allowance for the rig's calibration error in the two-view test, pixels (0: trust the rig fully). A real rig needs 0.3 to 1.
+    /// Allowance for the rig's calibration error in the two-view test, pixels (0: trust the rig fully). A real rig
+    /// needs 0.3 to 1.
     pub calibration_px: f64,
-    /// Systematic error that edge points share along a contour, pixels (0: none, as for points without an image). Detected edges
-    /// have 0.05 to 0.1; an ellipse that it could have made of a circle is taken for a circle.
+    /// Systematic error that edge points share along a contour, pixels (0: none, for points without an image).
+    /// Detected edges have 0.05 to 0.1. An ellipse that this error could have made out of a circle is reported as a
+    /// circle.
     pub edge_bias_px: f64,
-    /// Largest residual standard deviation that edge points may show, pixels.
+    /// Largest standard deviation of the residuals, pixels.
     pub max_noise_px: f64,
-    /// Smallest acceptable semi-minor axis of a rim's image, pixels (errata C1).
+    /// Smallest semi-minor axis of a rim's image, pixels: below it the rim is seen edge-on.
     pub min_minor_axis_px: f64,
-    /// Largest acceptable standard deviation of the centre (length units); `None`: a tenth of the rim's radius.
+    /// Largest standard deviation of the centre (length units); `None`: a tenth of the rim's radius.
     pub max_sigma_centre: Option<f64>,
-    /// Largest acceptable standard deviation of the normal, radians (errata C2: 2 degrees).
+    /// Largest standard deviation of the normal, radians. Default: 2 degrees.
     pub max_sigma_normal: f64,
 }
 
@@ -144,26 +103,13 @@ impl Default for Options {
 }
 
 impl Options {
-    /// The same, but whatever comes out is certain enough.
-    pub(in crate::offline) fn tolerating_anything(self) -> Self {
+    /// The same without limits on the uncertainty of the result.
+    pub(in crate::offline) fn without_tolerance(self) -> Self {
         Self { max_sigma_centre: Some(f64::INFINITY), max_sigma_normal: f64::INFINITY, ..self }
     }
 }
 
-/// An ellipse in an image or in a plane: centre, semi-axes `a >= b > 0`, direction of `a` in `[0, pi)` from x towards y.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Ellipse2 {
-    /// Centre.
-    pub centre: Vector2<f64>,
-    /// Semi-major axis.
-    pub a: f64,
-    /// Semi-minor axis.
-    pub b: f64,
-    /// Direction of the major axis, radians.
-    pub theta: f64,
-}
-
-/// A rim in space as a value: an ellipse, circle or the core circle of a bar.
+/// A rim in space: an ellipse, a circle, or the core circle of a bar.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rim {
     /// Centre in the frame of the projection matrices.
@@ -180,7 +126,7 @@ pub struct Rim {
     pub axis_b: Vector3<f64>,
 }
 
-/// What a model explains, for the information criterion.
+/// Fit and information criterion of one model.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Score {
     /// The model.
@@ -189,31 +135,32 @@ pub struct Score {
     pub chi2: f64,
     /// Number of parameters.
     pub parameters: usize,
-    /// Bayesian information criterion relative to the noise of the best model; the smallest wins.
+    /// Bayesian information criterion for the noise of the best model; the smallest wins.
     pub bic: f64,
-    /// Why the model is out of the question although it was tried, in words.
+    /// Why the model is excluded although it was fitted.
     pub excluded: Option<&'static str>,
 }
 
-/// How well the geometry determines the answer (errata C).
+/// How well the geometry determines the result.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Report {
     /// Square root of the trace of the centre's covariance, length units.
     pub sigma_centre: f64,
     /// Square root of the trace of the normal's covariance, radians.
     pub sigma_normal: f64,
-    /// The same *in the images*: of the centre relative to a gripper whose marks both cameras see at their predicted places. A loop closed in
-    /// both images ends there, whatever the rig error that moves rim and marks alike. Length units.
+    /// The same *in the images*: of the centre relative to a gripper whose marks are at their predicted positions in
+    /// both images. A loop closed in both images reaches this accuracy whatever the rig error, which displaces rim and
+    /// marks alike. Length units.
     pub sigma_centre_in_images: f64,
-    /// The same of the normal, radians.
+    /// The same for the normal, radians.
     pub sigma_normal_in_images: f64,
-    /// Size of the part of the edge error that varies smoothly round the contours, pixels.
+    /// Size of the edge error that varies smoothly along the contours, pixels.
     pub smooth_px: f64,
     /// Semi-minor axes of the rim's images, left and right, pixels.
     pub minor_axis_px: [f64; 2],
     /// Angle between the two viewing rays of the centre, radians.
     pub vergence: f64,
-    /// Largest eigenvalue that should be zero over the smaller of the two others (paper's route; 0 is perfect).
+    /// Largest eigenvalue that should be zero over the smaller of the two others (paper's method; 0 is perfect).
     pub rank2: f64,
     /// Smaller over larger of the two non-zero eigenvalues.
     pub separation: f64,
@@ -223,9 +170,10 @@ pub struct Report {
     pub gap_px: [f64; 2],
     /// Predicted standard deviation of the gaps from the two fits, pixels.
     pub gap_sigma_px: [f64; 2],
-    /// Excess of the two-view fit over the two one-view fits in units of the noise variance: chi-squared with 2 degrees of freedom for a match.
+    /// Excess of the two-view fit over the two one-view fits in units of the noise variance: chi-squared with 2
+    /// degrees of freedom for a match.
     pub excess: f64,
-    /// Angle between the planes of the paper's route and of the camera-symmetric closed form, radians.
+    /// Angle between the planes of the paper's method and of the camera-symmetric closed form, radians.
     pub routes_differ: f64,
     /// Weighted sum of squared residuals of the chosen model.
     pub chi2: f64,
@@ -233,11 +181,11 @@ pub struct Report {
     pub dof: usize,
     /// Noise standard deviation used in the covariances, in units of `EdgePoint::sigma`.
     pub noise: f64,
-    /// Every model that was tried.
+    /// Every model that was fitted.
     pub scores: Vec<Score>,
     /// Fitted ellipses in the images (of the outer outlines), left and right.
     pub image_ellipse: [Ellipse2; 2],
-    /// Residual of every input point against the chosen model, pixels, positive outside; in the order given.
+    /// Residual of every input point for the chosen model, pixels, positive outside; in input order.
     pub residuals: [Vec<f64>; 2],
     /// Whether each input point was used.
     pub inliers: [Vec<bool>; 2],
@@ -254,18 +202,19 @@ pub struct Reconstruction {
     pub bar_radius: Option<f64>,
     /// Covariance of the centre, length units squared.
     pub cov_centre: Matrix3<f64>,
-    /// Covariance of the normal, radians squared, in the columns `e1, e2` of [`crate::offline::rim::circle::frame_of`] the normal.
+    /// Covariance of the normal, radians squared, in the columns `e1, e2` of [`crate::offline::rim::circle::frame_of`]
+    /// the normal.
     pub cov_normal: Matrix2<f64>,
-    /// Covariance of the centre (rows) against the normal (columns `e1, e2`).
+    /// Cross-covariance of the centre (rows) and the normal (columns `e1, e2`).
     pub cov_centre_normal: Matrix3x2<f64>,
     /// Covariance of `(a, b)`; of `(R, r)` for a round bar.
     pub cov_axes: Matrix2<f64>,
-    /// Figures by which to judge it.
+    /// Quality figures.
     pub report: Report,
 }
 
 impl Reconstruction {
-    /// Half the width that a gripper has to span along the major and minor axis: the bar's radius counts.
+    /// Half the width that a gripper has to span along the major and the minor axis, including the bar's radius.
     pub fn half_widths(&self) -> (f64, f64) {
         let r = self.bar_radius.unwrap_or(0.0);
         (self.rim.a + r, self.rim.b + r)

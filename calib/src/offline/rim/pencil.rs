@@ -1,4 +1,5 @@
-//! The pencil of the two cones, `|Q + l Q'| = l (I3 l^2 + I2 l + I1)` (section 4.2), exact for two rank-3 cones without a polynomial fit.
+//! The pencil of the two cones, `|Q + l Q'| = l (I3 l^2 + I2 l + I1)` (section 4.2), exact for two rank-3 cones and
+//! without a polynomial fit.
 
 use crate::offline::conic::eigen;
 use nalgebra::{Matrix4, Vector4};
@@ -15,8 +16,8 @@ pub struct Pencil {
 }
 
 impl Pencil {
-    /// `I1 = e3(Q) n^T Q' n`, `I3 = e3(Q') n'^T Q n'`, `I2 = (|Q + Q'| + |Q - Q'|) / 2` (errata B1), where `e3` is the product of the
-    /// three non-zero eigenvalues and `n, n'` are the unit null vectors, the projection centres.
+    /// `I1 = e3(Q) n^T Q' n`, `I3 = e3(Q') n'^T Q n'`, `I2 = (|Q + Q'| + |Q - Q'|) / 2`, where `e3` is the product of
+    /// the three non-zero eigenvalues and `n, n'` are the unit null vectors, the projection centres.
     pub fn new(q: &Matrix4<f64>, qp: &Matrix4<f64>) -> Self {
         let (e, n) = cone_invariants(q);
         let (ep, np) = cone_invariants(qp);
@@ -27,13 +28,13 @@ impl Pencil {
         }
     }
 
-    /// Scale-free form of the paper's condition (equation 4): `1 - 4 I1 I3 / I2^2`. Zero for a match, but also as soon as ONE pair of
-    /// epipolar tangents agrees (errata B3): a score, not a test.
+    /// Scale-free form of the paper's condition (equation 4): `1 - 4 I1 I3 / I2^2`. Zero for a match, but also as soon
+    /// as only ONE pair of epipolar tangents agrees: a score, not a test.
     pub fn delta(&self) -> f64 {
         1.0 - 4.0 * self.i1 * self.i3 / (self.i2 * self.i2)
     }
 
-    /// The double root, `-I2 / (2 I3)` (errata A2; the paper prints it upside down).
+    /// The double root, `-I2 / (2 I3)`. The paper prints the reciprocal.
     pub fn lambda(&self) -> f64 {
         -self.i2 / (2.0 * self.i3)
     }

@@ -1,6 +1,8 @@
-//! The whole plane-conic chain on two sets of edge points: fits, cones, closed forms, two-view test, maximum likelihood.
+//! The complete plane-conic chain on two sets of edge points: fits, cones, closed forms, two-view test, maximum
+//! likelihood.
 //!
-//! [`analyse`] keeps every intermediate result, so that a report (or a judge) can see each step of the paper next to the refined answer.
+//! [`analyse`] keeps every intermediate result, so that a report can show each step of the paper next to the refined
+//! result.
 
 use crate::offline::conic::robust::{self, RobustFit};
 use crate::offline::conic::sampson::Cloud;
@@ -9,25 +11,28 @@ use crate::offline::correspondence::tangency::{excess_limit, gaps_with_sigma};
 use crate::offline::rim::circle::{ClosedForm, between_cameras, check_depth, check_front, extract};
 use crate::offline::rim::cone::{ConePair, check_cameras};
 use crate::offline::rim::ml::{MlFit, TwoViews};
-use crate::offline::rim::model::{EdgePoint, Noise, Options, Projection, Rim, RimModel};
+use crate::offline::rim::model::{Noise, Options, Rim, RimModel};
 use crate::offline::rim::pencil::Pencil;
 use crate::offline::rim::plane::{paper, polar};
 use crate::offline::rim::refusal::Refusal;
+use crate::offline::statistics::median;
+use crate::offline::types::EdgePoint;
+use crate::offline::types::projection::Projection;
 use graspd_rt::geom::View;
 use nalgebra::Vector3;
 
-/// Noise below this many pixels is rounding of the input, not noise.
+/// Noise below this is rounding of the input, pixels.
 const NOISE_FLOOR_PX: f64 = 1e-4;
 
-/// Axis ratio from which an ellipse is nearly a circle.
+/// Smallest axis ratio of an ellipse that is nearly a circle.
 const NEARLY_ROUND: f64 = 0.97;
 
-/// Everything that the plane-conic chain found.
+/// All results of the plane-conic chain.
 #[derive(Clone, Debug)]
 pub struct Analysis {
     /// Projection centres, left and right.
     pub centres: [Vector3<f64>; 2],
-    /// Ellipse fits in the images with the points they stand on.
+    /// Ellipse fits in the images with their inliers.
     pub fits: [RobustFit; 2],
     /// The viewing cones.
     pub cones: ConePair,
@@ -47,31 +52,33 @@ pub struct Analysis {
     pub ellipse: Result<MlFit, Refusal>,
     /// Maximum-likelihood circle.
     pub circle: Result<MlFit, Refusal>,
-    /// The circle in the plane between the cameras with its chi-squared, where the ellipse in the other plane is no circle.
+    /// The circle in the plane between the cameras with its chi-squared, where the ellipse in the other plane is not a
+    /// circle.
     pub between: Option<(Rim, f64)>,
     /// Two-view excess over the one-view fits, in units of the noise variance.
     pub excess: f64,
     /// Its limit at the gate.
     pub excess_limit: f64,
-    /// Whether the contours are two images of one plane rim seen from its face; otherwise why not.
+    /// Whether the contours are two images of one plane rim seen from its face; the error says why not.
     pub verdict: Result<(), Refusal>,
 }
 
 impl Analysis {
-    /// Any plane rim there is, the circle first: the outline of a bar is nearly round and a circle is stiffer.
+    /// Any fitted plane rim, the circle first: the outline of a bar is nearly round, and a circle has fewer
+    /// parameters.
     pub(crate) fn any_rim(&self) -> Option<Rim> {
         let fits = [&self.circle, &self.ellipse].into_iter().filter_map(|f| f.as_ref().ok()).map(|f| f.rim);
         let closed = [&self.polar, &self.paper].into_iter().filter_map(|f| f.as_ref().ok()).map(|f| f.rim);
         fits.chain(closed).next()
     }
 
-    /// Why there is no plane rim.
+    /// The reason why there is no plane rim.
     pub(crate) fn no_rim(&self) -> Refusal {
         self.verdict.clone().err().or(self.ellipse.clone().err()).unwrap_or(Refusal::NoFit { why: "no model fits" })
     }
 }
 
-/// The points of one outline, and where each comes from.
+/// Checks that coordinates are finite and sigmas positive.
 pub(crate) fn usable(points: &[EdgePoint]) -> Result<(), Refusal> {
     for p in points {
         if !(p.uv.x.is_finite() && p.uv.y.is_finite()) {
@@ -84,12 +91,12 @@ pub(crate) fn usable(points: &[EdgePoint]) -> Result<(), Refusal> {
     Ok(())
 }
 
-/// Median sigma of a set of points: turns units of sigma into pixels.
+/// Median sigma of a set of points: converts units of sigma to pixels.
 pub(crate) fn typical_sigma(points: &[EdgePoint]) -> f64 {
-    robust::median(points.iter().map(|p| p.sigma).collect())
+    median(points.iter().map(|p| p.sigma).collect())
 }
 
-/// Ellipse fit of a view with the refusals that concern one view.
+/// Ellipse fit of one view, with the refusals that concern one view.
 fn fit_view(points: &[EdgePoint], view: View, options: &Options) -> Result<RobustFit, Refusal> {
     let fitted = if options.robust {
         robust::fit(points, options.scatter)
@@ -108,7 +115,8 @@ fn fit_view(points: &[EdgePoint], view: View, options: &Options) -> Result<Robus
     if minor < options.min_minor_axis_px {
         return Err(Refusal::EdgeOn { view, minor_px: minor, limit_px: options.min_minor_axis_px });
     }
-    // Scatter of a tenth of the minor axis is not the noise of one contour, however large the contour; unless the points say that they are so noisy.
+    // Scatter of a tenth of the minor axis is not the noise of one contour, however large the contour, unless the
+    // given sigmas state such noise.
     let stated = if options.noise == Noise::AtLeastGiven { 2.0 * typical_sigma(points) } else { 0.0 };
     let limit_px = options.max_noise_px.min((0.1 * minor).max(stated));
     if !(sigma_px <= limit_px) {
@@ -121,14 +129,18 @@ fn fit_view(points: &[EdgePoint], view: View, options: &Options) -> Result<Robus
     Ok(fitted)
 }
 
-/// Runs the chain. An error means that one view alone, or the cameras, make it pointless; the two-view verdict is in the result.
+/// Runs the chain.
+///
+/// # Errors
+/// A [`Refusal`] when one view alone or the cameras make a result impossible. The result of the two-view test is in
+/// [`Analysis::verdict`].
 pub fn analyse(points: [&[EdgePoint]; 2], p: [&Projection; 2], options: &Options) -> Result<Analysis, Refusal> {
     usable(points[0])?;
     usable(points[1])?;
     let centres = check_cameras(p[0], p[1])?;
     let fits = [fit_view(points[0], View::Left, options)?, fit_view(points[1], View::Right, options)?];
     let (noise, known) = pooled_noise(&fits, points, options);
-    judgeable(&fits, points, noise, known, options)?;
+    check_testable(&fits, points, noise, known, options)?;
     let cones = ConePair::new([&fits[0].fit.conic, &fits[1].fit.conic], p)?;
     let pencil = Pencil::new(&cones.q[0], &cones.q[1]);
     let (gap_px, gap_sigma_px) = gaps_with_sigma(
@@ -173,8 +185,8 @@ pub fn analyse(points: [&[EdgePoint]; 2], p: [&Projection; 2], options: &Options
     Ok(analysis)
 }
 
-/// Noise of both fits together (never below rounding, nor below the given sigmas if so asked), and whether it is known rather than
-/// estimated.
+/// Pooled noise of both fits (not below rounding, nor below the given sigmas if so requested), and whether it is known
+/// rather than estimated.
 fn pooled_noise(fits: &[RobustFit; 2], points: [&[EdgePoint]; 2], options: &Options) -> (f64, bool) {
     let dof = (fits[0].fit.count + fits[1].fit.count).saturating_sub(10);
     let estimated = ((fits[0].fit.chi2 + fits[1].fit.chi2) / dof.max(1) as f64).sqrt();
@@ -186,9 +198,9 @@ fn pooled_noise(fits: &[RobustFit; 2], points: [&[EdgePoint]; 2], options: &Opti
     }
 }
 
-/// Refuses so few points that their own scatter cannot tell a match from chance: with the noise unknown, ten residuals beyond the
-/// parameters are needed; with sigmas given, the scatter must at least agree with them.
-fn judgeable(
+/// Refuses so few points that their own scatter cannot separate a match from chance. With unknown noise, ten residuals
+/// beyond the parameters are required; with given sigmas, the scatter must at least agree with them.
+fn check_testable(
     fits: &[RobustFit; 2],
     points: [&[EdgePoint]; 2],
     noise: f64,
@@ -203,7 +215,7 @@ fn judgeable(
     Err(Refusal::TooFewPoints { view: View::BOTH[k], count: points[k].len(), needed: 10 })
 }
 
-/// Both maximum-likelihood fits from every closed form there is, the better of the minima, then checked for cameras and face.
+/// Both maximum-likelihood fits from every closed form, the better minimum of each, then checked for cameras and face.
 fn refine(
     views: &TwoViews,
     paper: &Result<ClosedForm, Refusal>,
@@ -213,7 +225,7 @@ fn refine(
 ) -> (Result<MlFit, Refusal>, Result<MlFit, Refusal>) {
     let mut starts: Vec<Rim> = [polar, paper].into_iter().filter_map(|c| c.as_ref().ok()).map(|c| c.rim).collect();
     starts.retain(|r| check_front(r, p, centres).is_ok());
-    // The two routes nearly coincide on good data: then one start is enough.
+    // The two methods nearly coincide on good data: then one start is enough.
     if let [a, b] = starts[..]
         && (a.centre - b.centre).norm() < 0.05 * a.a
         && a.normal.dot(&b.normal) > 0.99
@@ -222,7 +234,7 @@ fn refine(
     }
     if starts.is_empty() {
         let why = polar.as_ref().err().or(paper.as_ref().err()).cloned();
-        let why = why.unwrap_or(Refusal::OppositeSides { why: "the closed form lies behind a camera or faces away" });
+        let why = why.unwrap_or(Refusal::OppositeSides { why: "the closed-form rim is behind a camera or faces away" });
         return (Err(why.clone()), Err(why));
     }
     let ellipse = best(views, &starts, RimModel::Ellipse, p, centres);
@@ -238,8 +250,9 @@ fn refine(
     (ellipse, circle)
 }
 
-/// A circle is the rarer of the two by far: where the plane between the cameras carries one and the plane before them does not, they look at opposite faces
-/// of something thin.
+/// The circle in the plane between the cameras. A circle is far less likely by chance than an ellipse: where that
+/// plane carries a circle and the plane in front of the cameras does not, they look at opposite faces of a thin
+/// object.
 fn between(
     views: &TwoViews,
     ellipse: &Result<MlFit, Refusal>,
@@ -258,7 +271,7 @@ fn between(
     views.fit(&Rim { a: r, b: r, ..start }, RimModel::Circle).ok().map(|f| (f.rim, f.chi2))
 }
 
-/// The lowest admissible minimum over some starts.
+/// The lowest admissible minimum over several starts.
 fn best(
     views: &TwoViews,
     starts: &[Rim],
@@ -284,7 +297,7 @@ fn best(
     found
 }
 
-/// The two-view test. `slack` is the excess that the rig's calibration error may cause.
+/// The two-view test. `slack` is the excess that the calibration error of the rig may cause.
 fn verdict(a: &Analysis, options: &Options, slack: f64) -> Result<(), Refusal> {
     let mismatch = || {
         Err(Refusal::Mismatch {
@@ -298,14 +311,16 @@ fn verdict(a: &Analysis, options: &Options, slack: f64) -> Result<(), Refusal> {
     let gate = |k: usize| options.gate_sigmas * a.gap_sigma_px[k].hypot(options.calibration_px);
     let gaps_open = (0..2).any(|k| a.gap_px[k].abs() > gate(k));
     if a.ellipse.is_err() && a.circle.is_err() {
-        // A wrong pair is the likelier explanation when the tangents disagree, and the one that the operator can mend.
+        // A wrong pair is the more likely explanation when the tangents disagree, and the one that the operator can
+        // correct.
         if gaps_open {
             return mismatch();
         }
         return Err(a.ellipse.clone().err().unwrap_or(Refusal::NoFit { why: "no model fits" }));
     }
-    // The excess is exact where the gaps are only linearised (short arcs) or do not exist (epipole inside); the gaps say more where the
-    // rig itself is in doubt, because a calibration error moves both curves as a whole.
+    // The excess is exact where the gaps are only linearised (short arcs) or undefined (epipole inside). The gaps are
+    // more informative where the rig itself is uncertain, because a calibration error displaces both curves as a
+    // whole.
     let excess_open = a.excess > a.excess_limit + slack;
     let gaps_known = a.gap_px.iter().all(|g| g.is_finite());
     let open = if options.calibration_px > 0.0 && gaps_known { gaps_open && excess_open } else { excess_open };

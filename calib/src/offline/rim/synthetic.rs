@@ -1,8 +1,10 @@
-//! Scenes for this crate's own tests and for the accuracy study: a verged rig and rims seen by it, as the reference generates them.
+//! Synthetic scenes for tests and for the accuracy study: a verged rig and the rims it sees, generated as in the
+//! reference.
 
 use crate::offline::rim::circle::frame_of;
-use crate::offline::rim::cone::project;
-use crate::offline::rim::model::{Projection, Rim};
+use crate::offline::rim::model::Rim;
+use crate::offline::types::projection::Projection;
+use crate::offline::types::projection::project;
 use nalgebra::{Matrix3, Vector2, Vector3};
 use std::f64::consts::TAU;
 
@@ -11,7 +13,7 @@ pub fn rig(baseline: f64, focal: f64, distance: f64) -> [Projection; 2] {
     [-0.5, 0.5].map(|s| camera(Vector3::new(s * baseline, 0.0, 0.0), Vector3::new(0.0, 0.0, distance), focal))
 }
 
-/// A camera at `o` that looks at `target`, its y axis as near as can be to the world's.
+/// A camera at `o` that looks at `target`, with its y axis as close as possible to the world's.
 pub fn camera(o: Vector3<f64>, target: Vector3<f64>, focal: f64) -> Projection {
     let z = (target - o).normalize();
     let x = Vector3::y().cross(&z).normalize();
@@ -54,7 +56,7 @@ pub fn rim_point(rim: &Rim, t: f64) -> Vector3<f64> {
 pub struct Random(u64);
 
 impl Random {
-    /// A stream of its own for every seed.
+    /// An independent stream for every seed.
     pub fn new(seed: u64) -> Self {
         Self(seed.wrapping_mul(0xd134_2543_de82_ef95).wrapping_add(0x2545_f491_4f6c_dd1d))
     }

@@ -1,29 +1,32 @@
-//! What contours may be images of: a plane circle or ellipse, a round bar; where their outlines lie, and how
-//! parameters move them.
+//! The shapes that contours may be images of: a plane circle or ellipse, a round bar. Their outlines in an image, and
+//! the derivatives of those by the shape's parameters.
 
 use crate::offline::bar::torus::{Torus, rays};
 use crate::offline::conic::sampson::distance;
 use crate::offline::conic::{image_of_unit_circle, orient};
 use crate::offline::rim::circle::{frame_of, signed_axis};
-use crate::offline::rim::model::{EdgePoint, Projection, Rim};
+use crate::offline::rim::model::Rim;
+use crate::offline::types::EdgePoint;
+use crate::offline::types::projection::Projection;
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 
-/// Usual radius of a bar as a fraction of its ring's, and how far bars differ from it, as a natural logarithm: hand
-/// wheels, handles and pipes lie between a thirtieth and a half.
+/// Usual radius of a bar as a fraction of its core radius.
 const USUAL_BAR: f64 = 0.12;
+/// Standard deviation of the bar radius from the usual one, natural logarithm: hand wheels, handles and pipes lie
+/// between a thirtieth and a half.
 const BAR_SPREAD: f64 = 0.6;
-/// Parameters of a shape at most.
-pub(super) const SHAPE: usize = 8;
+/// Largest number of parameters of a shape.
+pub(super) const PARAMETERS: usize = 8;
 
-/// What a set of contours is an image of.
+/// The shape of a set of contours.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(in crate::offline) enum Shape {
     /// A plane circle.
     Circle(Rim),
-    /// A plane ellipse, and how far it is from round: standard deviation of its unevenness as a fraction of its size.
+    /// A plane ellipse, and the prior standard deviation of its unevenness as a fraction of its size.
     Ellipse(Rim, f64),
-    /// A round bar; and where somebody said it, its radius with the relative uncertainty of that. The fitted
-    /// parameter is the radius' logarithm.
+    /// A round bar, and its known radius with relative standard deviation, if given. The fitted parameter is the
+    /// logarithm of the radius.
     Bar(Torus, Option<(f64, f64)>),
 }
 
@@ -57,13 +60,13 @@ impl Shape {
         }
     }
 
-    /// Standard deviation of each parameter before anything is seen, natural units, and how far the present value is
-    /// from the prior's mean in them. Place and direction are as good as free; what tells models from each other is
-    /// how far an ellipse is from round and how thick a bar is.
-    pub(super) fn prior(&self) -> ([f64; SHAPE], [f64; SHAPE]) {
+    /// Prior standard deviation of each parameter in natural units, and the present value's distance from the prior's
+    /// mean in that unit. Position and direction are practically free. What distinguishes the models is how far an
+    /// ellipse is from round, and how thick a bar is.
+    pub(super) fn prior(&self) -> ([f64; PARAMETERS], [f64; PARAMETERS]) {
         let (reach, size) = (self.centre().norm(), self.size());
         let mut sd = [reach, reach, reach, 1.0, 1.0, 0.5 * size, 0.0, 0.0];
-        let mut off = [0.0; SHAPE];
+        let mut off = [0.0; PARAMETERS];
         match self {
             Self::Circle(_) => {}
             Self::Ellipse(r, uneven) => {
@@ -81,9 +84,9 @@ impl Shape {
         (sd, off)
     }
 
-    /// The shape moved by natural parameters: centre, normal turned towards `frame_of`'s axes, radius (and its
-    /// unevenness along and between those axes), or core and bar radius.
-    pub(super) fn moved(&self, d: &[f64; SHAPE]) -> Option<Self> {
+    /// The shape changed by natural parameters: centre, normal turned towards the axes of `frame_of`, radius (and its
+    /// unevenness along and between those axes), or core and bar radius. `None` where the shape collapses.
+    pub(super) fn moved(&self, d: &[f64; PARAMETERS]) -> Option<Self> {
         let f = frame_of(&self.normal());
         let normal = (self.normal() + f.column(0) * d[3] + f.column(1) * d[4]).try_normalize(0.1)?;
         let centre = self.centre() + Vector3::new(d[0], d[1], d[2]);
@@ -107,8 +110,8 @@ impl Shape {
         })
     }
 
-    /// Natural parameters that lead from this shape to another of its kind, near it.
-    pub(super) fn difference(&self, to: &Self) -> [f64; SHAPE] {
+    /// Natural parameters that lead from this shape to a nearby one of its kind.
+    pub(super) fn difference(&self, to: &Self) -> [f64; PARAMETERS] {
         let f = frame_of(&self.normal());
         let (c, n) = (to.centre() - self.centre(), to.normal() - self.normal());
         let mut d = [c.x, c.y, c.z, f.column(0).dot(&n), f.column(1).dot(&n), to.size() - self.size(), 0.0, 0.0];
@@ -123,40 +126,40 @@ impl Shape {
         d
     }
 
-    /// Where points of a view lie about the shape's outline there. `None` where a camera or the shape's image is
+    /// A view's points relative to the shape's outline there. `None` where a camera or the image of the shape is
     /// degenerate.
-    pub(super) fn places(&self, points: &[EdgePoint], p: &Projection) -> Option<Vec<Place>> {
+    pub(super) fn outline_points(&self, points: &[EdgePoint], p: &Projection) -> Option<Vec<OutlinePoint>> {
         match self {
             Self::Circle(r) | Self::Ellipse(r, _) => {
                 let h = homography(p, r);
                 let conic = orient(&image_of_unit_circle(&(h / h.norm())));
                 let back = h.try_inverse()?;
-                let place = |q: &EdgePoint| {
+                let point = |q: &EdgePoint| {
                     let y = back * q.uv.push(1.0);
                     let on_circle = Vector2::new(y.x / y.z, y.y / y.z).try_normalize(0.0)?;
                     let foot = r.centre + r.axis_a * (r.a * on_circle.x) + r.axis_b * (r.b * on_circle.y);
                     let gradient = (conic * q.uv.push(1.0)).xy().try_normalize(0.0)?;
-                    Some(Place { residual: distance(&conic, &q.uv), gradient, foot })
+                    Some(OutlinePoint { residual: distance(&conic, &q.uv), gradient, foot })
                 };
-                points.iter().map(place).collect()
+                points.iter().map(point).collect()
             }
             Self::Bar(t, _) => rays(points, p)?
                 .iter()
-                .map(|ray| t.touch(ray).map(|(residual, gradient, foot)| Place { residual, gradient, foot }))
+                .map(|ray| t.touch(ray).map(|(residual, gradient, foot)| OutlinePoint { residual, gradient, foot }))
                 .collect(),
         }
     }
 
-    /// Motion of a point of the outline by each parameter, in units of the parameter.
-    pub(super) fn moves(&self, foot: &Vector3<f64>) -> [Vector3<f64>; SHAPE] {
+    /// Motion of a point of the outline by each parameter, per unit of the parameter.
+    pub(super) fn motions(&self, foot: &Vector3<f64>) -> [Vector3<f64>; PARAMETERS] {
         let f = frame_of(&self.normal());
         let arm = foot - self.centre();
         let (e1, e2, n) = (f.column(0).into_owned(), f.column(1).into_owned(), f.column(2).into_owned());
-        let mut out = [Vector3::zeros(); SHAPE];
+        let mut out = [Vector3::zeros(); PARAMETERS];
         out[0] = Vector3::x();
         out[1] = Vector3::y();
         out[2] = Vector3::z();
-        // A turn w moves the normal by w x n.
+        // A rotation w moves the normal by w x n.
         out[3] = n.cross(&e1).cross(&arm);
         out[4] = n.cross(&e2).cross(&arm);
         match self {
@@ -181,36 +184,36 @@ impl Shape {
     }
 }
 
-/// Where an edge point lies about a shape's outline.
+/// An edge point relative to the outline of a shape.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Place {
+pub(super) struct OutlinePoint {
     /// Distance from the outline, pixels, positive outside.
     pub(super) residual: f64,
-    /// Direction in the image in which the distance grows.
+    /// Gradient direction of the distance in the image.
     pub(super) gradient: Vector2<f64>,
-    /// The shape's point that the outline shows there.
+    /// The point of the shape that the outline shows there.
     pub(super) foot: Vector3<f64>,
 }
 
-impl Place {
-    /// Change of the residual while the shown point moves: the outline moves under the edge point.
+impl OutlinePoint {
+    /// Change of the residual when the shown point moves: the outline moves under the edge point.
     pub(super) fn by_motion(&self, motion: &Vector3<f64>, p: &Projection) -> f64 {
         -self.seen(&(p.fixed_view::<3, 3>(0, 0) * motion), p)
     }
 
-    /// Change of the residual while the camera's projection changes.
+    /// Change of the residual when the camera's projection changes.
     pub(super) fn by_camera(&self, change: &Projection, p: &Projection) -> f64 {
         -self.seen(&(change * self.foot.push(1.0)), p)
     }
 
-    /// A change of the shown point's homogeneous image along the gradient, pixels.
+    /// Change of the shown point's homogeneous image along the gradient, pixels.
     fn seen(&self, d: &Vector3<f64>, p: &Projection) -> f64 {
         let h = p * self.foot.push(1.0);
         self.gradient.dot(&(d.xy() - h.xy() * (d.z / h.z))) / h.z
     }
 }
 
-/// The frame of a plane carried along when its normal turns.
+/// The axes of a plane, transported when its normal turns.
 fn turned_frame(f: &Matrix3<f64>, normal: &Vector3<f64>) -> Option<[Vector3<f64>; 2]> {
     let e1 = f.column(0).into_owned();
     let e1 = (e1 - normal * normal.dot(&e1)).try_normalize(1e-6)?;
@@ -243,10 +246,10 @@ fn homography(p: &Projection, r: &Rim) -> Matrix3<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::offline::rim::model::Outline;
     use crate::offline::rim::synthetic::{rig, rim_points, rim_tilted};
+    use crate::offline::types::Outline;
 
-    /// Edge points a little beside the outline of an ellipse that is near every shape of the test.
+    /// Edge points slightly off the outline of an ellipse that is near every shape of the test.
     fn near(p: &Projection) -> Vec<EdgePoint> {
         let other = rim_tilted(Vector3::new(0.02, -0.05, 1.5), 0.5, 1.0, 0.0805, 0.0798);
         let at = |uv: Vector2<f64>| EdgePoint { uv: uv + Vector2::new(0.2, -0.1), sigma: 0.1, outline: Outline::Outer };
@@ -258,40 +261,40 @@ mod tests {
         residuals(h).iter().zip(residuals(-h)).map(|(a, b)| (a - b) / (2.0 * h)).collect()
     }
 
-    fn assert_alike(analytic: impl Iterator<Item = f64>, numeric: &[f64], what: &str) {
+    fn assert_close(analytic: impl Iterator<Item = f64>, numeric: &[f64], what: &str) {
         let largest = numeric.iter().fold(0.0f64, |m, s| m.max(s.abs()));
         assert!(largest > 0.0, "{what} moves nothing");
         for (a, n) in analytic.zip(numeric) {
-            // Edges that lie beside the outline have a slope that differs by their distance over its radius of curvature.
+            // For edges off the outline the slope differs by their distance over its radius of curvature.
             assert!((a - n).abs() < 0.03 * largest, "{what}: {a} against {n}");
         }
     }
 
     #[test]
-    fn residuals_change_with_shape_and_camera_as_by_finite_differences() {
+    fn derivatives_agree_with_finite_differences() {
         let rim = rim_tilted(Vector3::new(0.02, -0.05, 1.5), 0.5, 1.0, 0.08, 0.0797);
         let round = Rim { b: rim.a, ..rim };
         let torus = Torus { centre: rim.centre, normal: rim.normal, core: 0.07, bar: 0.01 };
         for shape in [Shape::Circle(round), Shape::Ellipse(rim, 0.25), Shape::Bar(torus, None)] {
             for p in rig(0.5, 1200.0, 1.5) {
                 let points = near(&p);
-                let here = shape.places(&points, &p).unwrap();
+                let here = shape.outline_points(&points, &p).unwrap();
                 let residuals = |s: &Shape, p: &Projection| -> Vec<f64> {
-                    s.places(&points, p).unwrap().iter().map(|place| place.residual).collect()
+                    s.outline_points(&points, p).unwrap().iter().map(|point| point.residual).collect()
                 };
                 for k in 0..shape.parameters() {
                     let moved = |by: f64| {
                         let d = std::array::from_fn(|i| if i == k { by } else { 0.0 });
                         residuals(&shape.moved(&d).unwrap(), &p)
                     };
-                    let own = here.iter().map(|place| place.by_motion(&shape.moves(&place.foot)[k], &p));
-                    assert_alike(own, &slopes(moved, 1e-6), &format!("{shape:?}, parameter {k}"));
+                    let own = here.iter().map(|point| point.by_motion(&shape.motions(&point.foot)[k], &p));
+                    assert_close(own, &slopes(moved, 1e-6), &format!("{shape:?}, parameter {k}"));
                 }
                 let mut change = Projection::zeros();
                 change.set_row(0, &(p.row(2) * 2.0));
                 change.set_row(1, &(p.row(0) * 1e-3));
-                let own = here.iter().map(|place| place.by_camera(&change, &p));
-                assert_alike(
+                let own = here.iter().map(|point| point.by_camera(&change, &p));
+                assert_close(
                     own,
                     &slopes(|by| residuals(&shape, &(p + change * by)), 1e-3),
                     &format!("{shape:?}, camera"),

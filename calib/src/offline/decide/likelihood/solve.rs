@@ -1,24 +1,23 @@
-//! Solution of the linear model for one size of the edge noise and of the smooth edge error, and the search for both
-//! sizes.
+//! The solution of the linear model for one size of the edge noise and of the smooth edge error, and the search for
+//! both sizes.
 
 use super::linear::Linear;
-use super::{OUTLIER_SIGMAS, Stretch};
+use super::model::{OUTLIER_SIGMAS, Stretch, USUAL_WAVE_PX};
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 
-/// Waves of smooth edge error round a contour, relative to each other, by number of periods: slow ones move whole
-/// outlines and are the rule, quick ones come from shading here and there.
+/// Relative sizes of the waves of smooth edge error along a contour, by number of periods: slow ones displace entire
+/// outlines and always exist, fast ones come from local shading.
 const WAVES: [f64; 7] = [1.0, 1.0, 0.6, 0.4, 0.3, 0.3, 0.3];
-/// Columns of a contour's waves: one constant, a cosine and a sine for each period.
+/// Columns of a contour's waves: a constant, and a cosine and a sine for each period.
 const COLUMNS: usize = 2 * WAVES.len() - 1;
 /// Sizes of the smooth edge error that are compared, pixels.
 const WAVE_PX: [f64; 7] = [0.02, 0.035, 0.06, 0.1, 0.18, 0.32, 0.6];
-/// Its expected size, pixels, and how far that is off as a natural logarithm: detected edges show 0.03 to 0.15.
-pub(super) const USUAL_WAVE_PX: f64 = 0.07;
+/// Spread of its size about [`USUAL_WAVE_PX`], natural logarithm: detected edges show 0.03 to 0.15 px.
 const WAVE_SPREAD: f64 = 0.7;
-/// No smooth edge error at all.
+/// No smooth edge error.
 pub(super) const NO_WAVES: Option<f64> = None;
-/// Strength of the belief that points scatter as they say (`kappa = 1`), in points.
-const NOISE_BELIEF: f64 = 6.0;
+/// Weight of the prior `kappa = 1` (points scatter by their stated sigma), in points.
+const NOISE_PRIOR_POINTS: f64 = 6.0;
 
 /// Sums of the linear model over the points that are used, in units of their sigmas.
 pub(super) struct Sums {
@@ -30,27 +29,27 @@ pub(super) struct Sums {
     count: usize,
 }
 
-/// A contour's waves: no two contours share any, so that each block is eliminated on its own.
+/// A contour's waves. No two contours share any, so that each block is eliminated separately.
 struct Waves {
     normal: SMatrix<f64, COLUMNS, COLUMNS>,
     cross: DMatrix<f64>,
     gradient: SVector<f64, COLUMNS>,
 }
 
-/// The sums with those of the waves.
-pub(super) struct Whole<'a> {
+/// The sums together with those of the waves.
+pub(super) struct WavySums<'a> {
     sums: &'a Sums,
     waves: Vec<Waves>,
 }
 
-/// Solution for one size of the noise: step and inverse normal matrix of everything but the waves.
+/// Solution for one size of the noise: step and inverse normal matrix of everything except the waves.
 pub(super) struct Solved {
     pub(super) step: DVector<f64>,
     pub(super) inverse: DMatrix<f64>,
     pub(super) chi2: f64,
     pub(super) log_evidence: f64,
     pub(super) kappa: f64,
-    /// Size of the smooth error, pixels, where there is any.
+    /// Size of the smooth error, pixels, if any.
     pub(super) wave_px: Option<f64>,
 }
 
@@ -61,12 +60,12 @@ impl Solved {
     }
 }
 
-/// What eliminating the waves leaves.
+/// Result of eliminating the waves.
 struct Reduced {
-    /// Taken off the normal matrix and the gradient.
+    /// Subtracted from the normal matrix and the gradient.
     normal: DMatrix<f64>,
     gradient: DVector<f64>,
-    /// Taken off chi-squared.
+    /// Subtracted from chi-squared.
     square: f64,
     log_det: f64,
     /// `B^-1` of each contour's block.
@@ -79,7 +78,7 @@ impl Sums {
         let scaled = DMatrix::from_fn(rows.len(), linear.columns.ncols(), |i, k| {
             linear.columns[(rows[i], k)] / linear.sigma[rows[i]]
         });
-        let r = DVector::from_fn(rows.len(), |i, _| linear.places[rows[i]].residual / linear.sigma[rows[i]]);
+        let r = DVector::from_fn(rows.len(), |i, _| linear.points[rows[i]].residual / linear.sigma[rows[i]]);
         Self {
             normal: scaled.tr_mul(&scaled),
             gradient: scaled.tr_mul(&r),
@@ -89,19 +88,19 @@ impl Sums {
         }
     }
 
-    pub(super) fn with_waves(&self, linear: &Linear, stretches: &[Stretch], used: &[bool]) -> Whole<'_> {
+    pub(super) fn with_waves(&self, linear: &Linear, stretches: &[Stretch], used: &[bool]) -> WavySums<'_> {
         let mut first = 0;
         let waves = stretches.iter().map(|s| {
             let rows = first..first + s.points.len();
             first = rows.end;
-            Waves::new(linear, rows.zip(&s.place).filter(|(i, _)| used.get(*i).is_some_and(|u| *u)))
+            Waves::new(linear, rows.zip(&s.parameter).filter(|(i, _)| used.get(*i).is_some_and(|u| *u)))
         });
-        Whole { waves: waves.collect(), sums: self }
+        WavySums { waves: waves.collect(), sums: self }
     }
 
     /// The solution without waves.
     pub(super) fn solve(&self, linear: &Linear, wave_px: Option<f64>, kappa: f64) -> Option<Solved> {
-        Whole { sums: self, waves: Vec::new() }.solve(linear, wave_px, kappa)
+        WavySums { sums: self, waves: Vec::new() }.solve(linear, wave_px, kappa)
     }
 }
 
@@ -118,29 +117,29 @@ impl Waves {
         out.cross = own.tr_mul(&scaled);
         for (i, w) in &rows {
             out.normal += w * w.transpose();
-            out.gradient += w * (linear.places[*i].residual / linear.sigma[*i]);
+            out.gradient += w * (linear.points[*i].residual / linear.sigma[*i]);
         }
         out
     }
 }
 
-/// The waves at a place round the contour.
+/// The waves at a parameter of the contour.
 fn waves_at(t: f64) -> SVector<f64, COLUMNS> {
     let mut out = SVector::zeros();
-    for (w, share) in WAVES.iter().enumerate() {
+    for (w, weight) in WAVES.iter().enumerate() {
         let (sin, cos) = (w as f64 * t).sin_cos();
         if w == 0 {
-            out[0] = *share;
+            out[0] = *weight;
         } else {
-            out[2 * w - 1] = share * cos;
-            out[2 * w] = share * sin;
+            out[2 * w - 1] = weight * cos;
+            out[2 * w] = weight * sin;
         }
     }
     out
 }
 
-impl Whole<'_> {
-    /// Eliminates waves of a size for a noise `kappa`, whose square is `k2`.
+impl WavySums<'_> {
+    /// Eliminates waves of a given size for a noise `kappa` with square `k2`.
     fn reduced(&self, wave_px: f64, k2: f64) -> Option<Reduced> {
         let width = self.sums.gradient.len();
         let mut out = Reduced {
@@ -163,8 +162,7 @@ impl Whole<'_> {
         Some(out)
     }
 
-    /// The linear model for a size of the smooth error; the noise of the points is brought to its best value from a
-    /// start.
+    /// Solves the linear model for a size of the smooth error, with the noise of the points optimised from a start.
     fn solve(&self, linear: &Linear, wave_px: Option<f64>, start: f64) -> Option<Solved> {
         let sums = self.sums;
         let width = sums.gradient.len();
@@ -187,7 +185,7 @@ impl Whole<'_> {
             let inverse = factor.inverse();
             let step = -(&inverse * &g);
             let chi2 = sums.square / k2 - reduced.square + prior + g.dot(&step);
-            // Of the priors' share of chi-squared and of the degrees of freedom.
+            // Contribution of the priors to chi-squared and to the degrees of freedom.
             let mut by_prior: f64 = (0..width).map(|k| (linear.offset[k] + step[k]).powi(2)).sum();
             let mut kept = inverse.trace();
             for (w, b) in self.waves.iter().zip(&reduced.inverse) {
@@ -201,13 +199,13 @@ impl Whole<'_> {
             let free = (sums.used as f64 - taken).max(1.0);
             let lost = (sums.count - sums.used) as f64 * OUTLIER_SIGMAS * OUTLIER_SIGMAS;
             let log_size = wave_px.map_or(0.0, |w| -0.5 * ((w / USUAL_WAVE_PX).ln() / WAVE_SPREAD).powi(2));
-            let log_noise = -0.5 * NOISE_BELIEF * (1.0 / k2 - 1.0 + k2.ln());
+            let log_noise = -0.5 * NOISE_PRIOR_POINTS * (1.0 / k2 - 1.0 + k2.ln());
             let log_waves = wave_px.map_or(0.0, |w| -w.ln() * (COLUMNS * self.waves.len()) as f64);
             let log_evidence = -0.5 * (chi2 + lost) - 0.5 * log_det + log_waves - sums.count as f64 * kappa.ln()
                 + log_size
                 + log_noise;
             best = Some(Solved { step, inverse, chi2, log_evidence, kappa, wave_px });
-            let next = ((data.max(0.0) + NOISE_BELIEF) / (free + NOISE_BELIEF)).sqrt();
+            let next = ((data.max(0.0) + NOISE_PRIOR_POINTS) / (free + NOISE_PRIOR_POINTS)).sqrt();
             if (next / kappa - 1.0).abs() < 0.02 {
                 break;
             }
@@ -216,7 +214,7 @@ impl Whole<'_> {
         best
     }
 
-    /// The same for the size of the smooth error that explains the points best: uphill from the usual one, since the
+    /// Solves for the size of the smooth error with the largest evidence: hill climbing from the usual size, since the
     /// evidence has one maximum.
     pub(super) fn best_noise(&self, linear: &Linear, kappa: f64) -> Option<Solved> {
         let usual = WAVE_PX.iter().position(|w| *w >= USUAL_WAVE_PX)?;
