@@ -101,7 +101,8 @@ fn marks(w: &mut Worst, id: &str, got: &Value, want: &Value, px: f64, length: f6
 #[test]
 fn every_golden_case_is_within_its_tolerances() {
     let input: Value = serde_json::from_str(CASES).unwrap();
-    let output: Value = serde_json::from_str(&graspd_calib::golden::reconstruct_file(CASES).unwrap()).unwrap();
+    let output: Value =
+        serde_json::from_str(&graspd_calib::commands::reconstruct::reconstruct_file(CASES).unwrap()).unwrap();
     let mut w = Worst::default();
     let cases = input["cases"].as_array().unwrap();
     let results = output["cases"].as_array().unwrap();
@@ -177,7 +178,8 @@ fn every_golden_case_is_within_its_tolerances() {
 fn random_rigs_agree_with_the_reference() {
     const RANDOM: &str = include_str!("data/conic_random.json");
     let input: Value = serde_json::from_str(RANDOM).unwrap();
-    let output: Value = serde_json::from_str(&graspd_calib::golden::reconstruct_file(RANDOM).unwrap()).unwrap();
+    let output: Value =
+        serde_json::from_str(&graspd_calib::commands::reconstruct::reconstruct_file(RANDOM).unwrap()).unwrap();
     let mut w = Worst::default();
     for (case, got) in input["cases"].as_array().unwrap().iter().zip(output["cases"].as_array().unwrap()) {
         let (id, want) = (case["id"].as_str().unwrap(), &case["expect"]);
@@ -203,7 +205,8 @@ fn random_rigs_agree_with_the_reference() {
 #[test]
 fn names_order_and_truth_do_not_matter() {
     let mut input: Value = serde_json::from_str(CASES).unwrap();
-    let plain: Value = serde_json::from_str(&graspd_calib::golden::reconstruct_file(CASES).unwrap()).unwrap();
+    let plain: Value =
+        serde_json::from_str(&graspd_calib::commands::reconstruct::reconstruct_file(CASES).unwrap()).unwrap();
     let cases = input["cases"].as_array_mut().unwrap();
     cases.reverse();
     let allowed = ["image_size", "P_left", "P_right", "points_left", "points_right", "sigma_px"];
@@ -213,7 +216,8 @@ fn names_order_and_truth_do_not_matter() {
         object.insert("id".into(), i.into());
     }
     let text = serde_json::to_string(&input).unwrap();
-    let mut again: Value = serde_json::from_str(&graspd_calib::golden::reconstruct_file(&text).unwrap()).unwrap();
+    let mut again: Value =
+        serde_json::from_str(&graspd_calib::commands::reconstruct::reconstruct_file(&text).unwrap()).unwrap();
     again["cases"].as_array_mut().unwrap().reverse();
     for (a, b) in plain["cases"].as_array().unwrap().iter().zip(again["cases"].as_array().unwrap()) {
         let (mut a, mut b) = (a.clone(), b.clone());
@@ -246,7 +250,8 @@ fn a_malformed_case_is_an_error_of_its_own() {
     text += "null,7,{},\"a \\\"NaN\\\" in a string\",";
     text += &serde_json::to_string(&good).unwrap();
     text += "]}";
-    let output: Value = serde_json::from_str(&graspd_calib::golden::reconstruct_file(&text).unwrap()).unwrap();
+    let output: Value =
+        serde_json::from_str(&graspd_calib::commands::reconstruct::reconstruct_file(&text).unwrap()).unwrap();
     let results = output["cases"].as_array().unwrap();
     assert_eq!(results.len(), bad.len() + 5);
     for (i, r) in results[..bad.len() + 4].iter().enumerate() {
@@ -255,6 +260,6 @@ fn a_malformed_case_is_an_error_of_its_own() {
     }
     assert_eq!(results.last().unwrap()["status"], "ok");
     for text in ["", "{", "[]", "{\"cases\":3}", "\u{feff}{}", "{\"cases\":[\"\\"] {
-        assert!(graspd_calib::golden::reconstruct_file(text).is_err(), "{text}");
+        assert!(graspd_calib::commands::reconstruct::reconstruct_file(text).is_err(), "{text}");
     }
 }

@@ -1,9 +1,9 @@
 //! A part with a mesh, from files to a plan: its pose from picked pixels as sure as it says, every handle, the same bytes twice.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
+use graspd_calib::commands::mesh::{MeshRequest, run};
+use graspd_calib::commands::{Class, Outcome};
 use graspd_calib::files::{GripperFile, PlanFile, RigFile};
-use graspd_calib::mesh_cli::{MeshRequest, run};
-use graspd_calib::plan_cli::{Class, Outcome};
 use graspd_rt::geom::{Pose, Vec3, View};
 use nalgebra::{Matrix3, Point3, UnitQuaternion};
 use rand::{RngExt, SeedableRng};

@@ -199,7 +199,7 @@ fn every_way_of_writing_a_part_is_read_alike() {
     same("polygons.obj", prism(&l, 30.0).as_bytes());
     // And in inches.
     let inches: Corners = solid.corners().iter().map(|t| t.map(|p| p.map(|x| x / 25.4))).collect();
-    let o = graspd_calib::mesh_cli::run(&graspd_calib::mesh_cli::MeshRequest {
+    let o = graspd_calib::commands::mesh::run(&graspd_calib::commands::mesh::MeshRequest {
         unit: "inch".to_owned(),
         ..f.request(&f.write("inch.stl", stl(&inches)))
     });

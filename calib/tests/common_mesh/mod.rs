@@ -1,8 +1,8 @@
 //! Parts for the tests of polyhedral handles: built from boxes, so that what is solid is known without the mesh, and written as files.
 #![allow(dead_code, clippy::unwrap_used)] // shared by test programs, each of which uses some of it
 
-use graspd_calib::mesh_cli::{MeshRequest, run};
-use graspd_calib::plan_cli::Class;
+use graspd_calib::commands::Class;
+use graspd_calib::commands::mesh::{MeshRequest, run};
 use graspd_rt::geom::{Pose, Vec3};
 use nalgebra::{Point3, Quaternion, UnitQuaternion};
 use rand::SeedableRng;
