@@ -1,8 +1,8 @@
 //! Everything that graspd computes before the arm moves.
 //!
 //! # Map
-//! - [`files`]: `rig.toml`, `gripper.toml`, `plan.toml`, pose and pick files. They are parsed into checked values; nothing
-//!   downstream validates again. Every key is described in `docs/FILES.md`.
+//! - [`files`]: `rig.toml`, `gripper.toml`, `plan.toml`, pose and pick files. They are parsed into checked values;
+//!   nothing downstream validates again. Every key is described in `docs/FILES.md`.
 //! - [`offline`]: the off-line stage, in the order of the paper. Two images of a rim become edges, contours, image
 //!   ellipses, cones, a rim in space, a grasp and a set-point (`offline::plan`). A part with a CAD model takes
 //!   `offline::polyhedral` (section 3.1) to the same set-point.

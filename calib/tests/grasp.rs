@@ -1,4 +1,5 @@
-//! The choice of the grasp on a rim: the free angle, the four positions, what hides marks, the turn and the path from the present pose.
+//! The choice of the grasp on a rim: the free angle, the four positions, occlusion of marks, the rotation and the path
+//! from the present pose.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::GripperFile;
@@ -28,7 +29,7 @@ fn rig() -> Rig {
     Rig { left: camera, right: camera, right_from_left: Pose::from_parts(Vec3::new(-0.48, 0.0, 0.08).into(), turn) }
 }
 
-/// A gripper with a plate of marks behind the fingers that leans by an angle about x; `body` adds a box.
+/// A gripper with a plate of marks behind the fingers, tilted by an angle about x; `body` adds a box.
 fn gripper(lean: f64, body: &str) -> GripperFile {
     let mut text = "schema = \"graspd-gripper/1\"\nopening_m = [0.0, 0.2]\nfinger_length_m = 0.06\n\
         flange_from_gripper = { translation_m = [0.0, 0.0, 0.2], quaternion_wxyz = [1.0, 0.0, 0.0, 0.0] }\n"
@@ -45,7 +46,7 @@ fn gripper(lean: f64, body: &str) -> GripperFile {
     GripperFile::parse(&(text + body), "gripper").unwrap()
 }
 
-/// A rim reconstructed from exact points of both views.
+/// A rim reconstructed from exact points in both views.
 fn rim(tilt: f64, azimuth: f64, a: f64, b: f64) -> Reconstruction {
     let truth = rim_tilted(Vec3::new(-0.05, 0.04, 1.4), tilt, azimuth, a, b);
     let p = View::BOTH.map(|v| projection(&rig(), v));
@@ -62,7 +63,8 @@ fn rim(tilt: f64, azimuth: f64, a: f64, b: f64) -> Reconstruction {
     reconstruct(&points[0], &p[0], &points[1], &p[1], &options).unwrap()
 }
 
-/// What both views see at an angle about the rim's axis: marks at grasp and pre-grasp, solid angle at the grasp.
+/// At an angle about the rim's axis: the marks visible in each view at both goals, the solid angles at the grasp, the
+/// grasp.
 fn at(scene: &Scene<'_>, r: &Reconstruction, a: &Approach, phi: f64) -> ([usize; 2], [f64; 2], Pose) {
     let x: Vec3 = direction(&r.rim, phi);
     let grasp = gripper_pose(&r.rim, &x, a.grasp_standoff);
@@ -73,7 +75,7 @@ fn at(scene: &Scene<'_>, r: &Reconstruction, a: &Approach, phi: f64) -> ([usize;
 }
 
 #[test]
-fn the_free_angle_is_the_best_of_the_whole_turn_for_the_better_view() {
+fn the_free_angle_is_the_best_of_all_angles_in_the_better_view() {
     let g = gripper(0.7, "[[body]]\ncentre_m = [0.0, 0.0, -0.1]\nhalf_size_m = [0.06, 0.02, 0.01]\n");
     for k in 0..8 {
         let r = rim(0.3 + 0.05 * f64::from(k), f64::from(k) * 0.8, 0.07, 0.07);
@@ -83,7 +85,7 @@ fn the_free_angle_is_the_best_of_the_whole_turn_for_the_better_view() {
         let rig = rig();
         let scene = Scene::new(&rig, &g, chosen.opening, Some(&obstacle));
         let flatness = chosen.flatness.unwrap();
-        assert!(flatness > FLAT, "a leaning plate determines the angle: {flatness}");
+        assert!(flatness > FLAT, "a tilted plate determines the angle: {flatness}");
         let v = usize::from(chosen.best_view == View::Right);
         let value = scene.visibilities(&chosen.grasp)[v].solid_angle;
         let (mut best, mut lo, mut hi) = (0.0f64, f64::INFINITY, 0.0f64);
@@ -98,7 +100,7 @@ fn the_free_angle_is_the_best_of_the_whole_turn_for_the_better_view() {
             assert!(value >= best * (1.0 - 1e-4), "{k}: {value} of {best}");
         }
         assert!((flatness - (hi - lo) / hi).abs() < 0.01, "{flatness} {lo} {hi}");
-        // The approach is against the normal, on the axis, and the jaws clear the rim.
+        // The approach is against the normal, on the axis, and the jaws open wider than the rim.
         assert!((chosen.grasp.rotation * Vec3::z() + r.rim.normal).norm() < 1e-9);
         assert!((chosen.pregrasp.translation.vector - r.rim.centre - r.rim.normal * 0.12).norm() < 1e-9);
         assert!(chosen.opening >= 2.0 * r.rim.a);
@@ -106,7 +108,7 @@ fn the_free_angle_is_the_best_of_the_whole_turn_for_the_better_view() {
 }
 
 #[test]
-fn marks_that_look_alike_at_every_angle_leave_the_smallest_turn() {
+fn equal_visibility_at_all_angles_gives_the_smallest_rotation() {
     let g = gripper(0.0, "");
     let r = rim(0.35, 0.9, 0.07, 0.07);
     let free = choose(&rig(), &g, &r, &Approach::default()).unwrap();
@@ -132,7 +134,7 @@ fn marks_that_look_alike_at_every_angle_leave_the_smallest_turn() {
 }
 
 #[test]
-fn too_large_a_turn_is_refused_with_the_smallest() {
+fn too_large_a_rotation_is_refused_and_the_smallest_is_reported() {
     let r = rim(0.35, 0.9, 0.07, 0.07);
     let mut present = gripper_pose(&r.rim, &direction(&r.rim, 0.0), 0.4);
     present.rotation *= UnitQuaternion::from_scaled_axis(Vec3::x() * 0.8);
@@ -158,7 +160,7 @@ fn an_ellipse_is_taken_along_an_axis_that_the_jaws_can_span() {
     assert_eq!(angles, [0, 90, 180, 270]);
     let x = chosen.grasp.rotation * Vec3::x();
     assert!(x.dot(&r.rim.axis_a).abs().max(x.dot(&r.rim.axis_b).abs()) > 1.0 - 1e-9);
-    // Jaws of 120 mm span the minor axis (108 with clearance), not the major (168).
+    // Jaws of 120 mm span the minor axis (108 mm with clearance), but not the major one (168 mm).
     let mut narrow = gripper(0.5, "");
     narrow.opening = [0.0, 0.12];
     let chosen = choose(&rig(), &narrow, &r, &Approach::default()).unwrap();
@@ -170,7 +172,7 @@ fn an_ellipse_is_taken_along_an_axis_that_the_jaws_can_span() {
 }
 
 #[test]
-fn the_gripper_and_the_object_hide_marks() {
+fn the_gripper_and_the_object_occlude_marks() {
     let r = rim(0.3, 0.4, 0.07, 0.07);
     let open = gripper(0.0, "");
     // A plate between the marks and the cameras: behind the marks, wider than all of them.
@@ -186,18 +188,18 @@ fn the_gripper_and_the_object_hide_marks() {
         choose(&rig, &shut, &r, &Approach::default()),
         Err(GraspError::MarksHidden { marks: 5, left: 0, right: 0 })
     ));
-    // A rim between the gripper and the cameras hides what is behind its disc.
+    // A rim between the gripper and the cameras occludes what is behind its disc.
     let wall = RimObstacle { centre: r.rim.centre + r.rim.normal * 0.3, normal: r.rim.normal, radius: 0.5 };
     assert_eq!(seen(&open, Some(&wall)), [0, 0]);
     let aside = RimObstacle { centre: wall.centre + Vec3::x() * 2.0, ..wall };
     assert_eq!(seen(&open, Some(&aside)), [5, 5]);
-    // Marks that face away are worth nothing.
+    // Marks that face away are not visible.
     let back = pose * Pose::rotation(Vec3::x() * PI);
     assert_eq!(Scene::new(&rig, &open, 0.15, None).visibilities(&back).map(|s| (s.seen, s.solid_angle)), [(0, 0.0); 2]);
 }
 
 #[test]
-fn the_path_tells_where_it_loses_marks() {
+fn the_path_reports_where_marks_are_lost() {
     let r = rim(0.3, 0.4, 0.07, 0.07);
     let (rig, g) = (rig(), gripper(0.0, ""));
     let scene = Scene::new(&rig, &g, 0.15, None);
@@ -205,12 +207,12 @@ fn the_path_tells_where_it_loses_marks() {
     let pregrasp = gripper_pose(&r.rim, &direction(&r.rim, 0.3), 0.12);
     let near = pregrasp * Pose::translation(0.02, 0.01, -0.1);
     assert_eq!(fewest_on_the_way(&scene, &[near, pregrasp, grasp], 20).map(|f| f.0), [5, 5]);
-    // Turned away at the start: nothing is seen there, and it says where.
+    // The gripper faces away at the start, where no mark is visible.
     let away = near * Pose::rotation(Vec3::x() * 2.2);
     for (n, fraction) in fewest_on_the_way(&scene, &[away, pregrasp, grasp], 20) {
         assert!(n < MIN_MARKS && fraction < 0.1, "{n} {fraction}");
     }
-    // A detour out of the image between two good poses.
+    // A detour out of the image between two visible poses.
     let out = Pose::translation(3.0, 0.0, 0.0) * near;
     for (n, fraction) in fewest_on_the_way(&scene, &[near, out, near], 20) {
         assert!(n == 0 && (0.1..0.9).contains(&fraction), "{n} {fraction}");

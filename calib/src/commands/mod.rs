@@ -1,8 +1,8 @@
 //! The off-line sub-commands of `graspd`, found by their names: a request with paths and options in; files, figures and
 //! text out.
 //!
-//! The command-line parser and the exit codes are the daemon's. A command reads its files itself, so that every failure is
-//! one sentence that names the file, the key or the option.
+//! The command-line parser and the exit codes are the daemon's. A command reads its files itself, so that every failure
+//! is one sentence that names the file, the key or the option.
 
 pub mod mesh;
 pub mod plan;
@@ -82,8 +82,8 @@ fn counts_from_one(option: &str, value: Option<usize>) -> Result<(), Failure> {
     if value == Some(0) { Err(usage(format!("--{option} 0: counting starts at 1"))) } else { Ok(()) }
 }
 
-/// Reads the pose given to an option: six numbers (metres and a rotation vector in radians, as the robot's pendant shows
-/// them) or a pose file with the pose called `key`.
+/// Reads the pose given to an option: six numbers (metres and a rotation vector in radians, as the robot's pendant
+/// shows them) or a pose file with the pose called `key`.
 ///
 /// # Errors
 /// Names the option or the file, and the accepted forms.

@@ -1,8 +1,8 @@
 //! `graspd reconstruct`: a file of two-view cases in, a file of reconstructions with every intermediate result out.
 //!
 //! Of the file, `cases` and `gripper` are read; of a case, `id`, `image_size`, `P_left`, `P_right`, `points_left`,
-//! `points_right` and `sigma_px`. A case that cannot be read or reconstructed gets `"status": "error"` and the reason; it
-//! does not affect the others.
+//! `points_right` and `sigma_px`. A case that cannot be read or reconstructed gets `"status": "error"` and the reason;
+//! it does not affect the others.
 
 use crate::offline::conic::sampson::distance;
 use crate::offline::conic::{ellipse_of, fit_direct, fit_ml};
@@ -45,8 +45,8 @@ pub fn reconstruct_file(cases_json: &str) -> Result<String, Error> {
     Ok(serde_json::to_string_pretty(&json!({ "schema": "conic-results/1", "cases": results }))?)
 }
 
-/// Replaces the tokens `NaN` and `Infinity` and numbers beyond the range of f64 by null, outside strings, so that one bad
-/// number invalidates one case only.
+/// Replaces the tokens `NaN` and `Infinity` and numbers beyond the range of f64 by null, outside strings, so that one
+/// bad number invalidates one case only.
 fn finite_numbers(text: &str) -> String {
     let bytes = text.as_bytes();
     let mut out = String::with_capacity(text.len());
@@ -221,8 +221,8 @@ fn scatter(points: &[Vec<EdgePoint>; 2]) -> Scatter {
     if across { Scatter::Across } else { Scatter::Isotropic }
 }
 
-/// The point of a conic nearest to a pixel, by three Newton steps on the tangent: where the curvature is high, the gradient
-/// at the pixel itself does not point to the nearest point.
+/// The point of a conic nearest to a pixel, by three Newton steps on the tangent: where the curvature is high, the
+/// gradient at the pixel itself does not point to the nearest point.
 fn foot(conic: &Matrix3<f64>, uv: &Vector2<f64>) -> Vector2<f64> {
     let normal = |q: &Vector2<f64>| {
         let g = conic * Vector3::new(q.x, q.y, 1.0);

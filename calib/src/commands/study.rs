@@ -1,8 +1,9 @@
-//! `graspd study`: the accuracy of the off-line stage against the Cramer-Rao bound, and the consistency of its covariances.
+//! `graspd study`: the accuracy of the off-line stage against the Cramer-Rao bound, and the consistency of its
+//! covariances.
 //!
-//! The cells are those of the accuracy study, with cells for gross outliers and occlusion added. Every trial draws a random
-//! rim, adds noise, reconstructs and compares with ground truth. The bounds are computed at the true rim from noise-free
-//! points.
+//! The cells are those of the accuracy study, with cells for gross outliers and occlusion added. Every trial draws a
+//! random rim, adds noise, reconstructs and compares with ground truth. The bounds are computed at the true rim from
+//! noise-free points.
 
 use crate::offline::conic::sampson::Cloud;
 use crate::offline::rim::circle::frame_of;
@@ -158,8 +159,8 @@ fn scene(cell: &Cell, random: &mut Random) -> Option<Scene> {
     Some(Scene { rim, p, points, exact })
 }
 
-/// Pixels at equal steps of arc length in the image, over the arc that begins at the fraction `from` of the rim and covers
-/// the fraction `arc` of it.
+/// Pixels at equal steps of arc length in the image, over the arc that begins at the fraction `from` of the rim and
+/// covers the fraction `arc` of it.
 fn equal_steps(p: &Projection, rim: &Rim, n: usize, from: f64, arc: f64) -> Vec<Vector2<f64>> {
     /// Chords that approximate the arc length of the whole rim.
     const FINE: usize = 1000;
@@ -291,8 +292,8 @@ pub fn run(cell: &Cell, trials: usize, seed: u64) -> (Option<Accuracy>, Accuracy
     ((cell.ratio == 1.0).then(|| circle.accuracy()), ellipse.accuracy())
 }
 
-/// Runs the given cells and returns a table with one line per cell and model. `progress` is called with the name of each
-/// finished cell.
+/// Runs the given cells and returns a table with one line per cell and model. `progress` is called with the name of
+/// each finished cell.
 pub fn table(cells: &[Cell], trials: usize, seed: u64, mut progress: impl FnMut(&str)) -> String {
     let mut out = String::from(
         "cell                        model    trials refused  centre mm (95 %)  normal deg (95 %)  \

@@ -13,8 +13,8 @@ use std::path::Path;
 const SCHEMA: &str = "graspd-gripper/1";
 /// Fewest marks that determine the gripper's pose without ambiguity.
 const MIN_MARKS: usize = 4;
-/// Smallest distance of at least one mark from the line through the others, metres: nearer marks leave the rotation about
-/// that line undetermined.
+/// Smallest distance of at least one mark from the line through the others, metres: nearer marks leave the rotation
+/// about that line undetermined.
 const MIN_MARK_SPREAD_M: f64 = 2e-3;
 
 /// The content of a gripper file: what the loop needs, and what planning and drawing need in addition.

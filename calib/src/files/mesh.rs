@@ -9,7 +9,8 @@ use std::path::Path;
 /// A pose in the left camera's frame, with its uncertainty.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PoseFile {
-    /// The pose: `left_from_mesh` of a part, `left_from_gripper` of the gripper at present, or `left_from_base` of an arm.
+    /// The pose: `left_from_mesh` of a part, `left_from_gripper` of the gripper at present, or `left_from_base` of an
+    /// arm.
     pub pose: Pose,
     /// Standard deviation of each coordinate, metres, if stated.
     pub sigma_m: Option<f64>,

@@ -1,9 +1,9 @@
 //! The files of the off-line stage: parsed into checked values, and written so that equal values give equal bytes.
 //!
-//! `rig.toml` holds the two cameras, `gripper.toml` the marks and the shape of the gripper, and `plan.toml` the result: the
-//! set-point of the on-line stage, and how it was computed. `pose.toml` and `picks.toml` give the pose of a part with a
-//! mesh. Every key is described in `docs/FILES.md`. Unknown keys, missing keys, NaN, infinity and impossible shapes are
-//! refused with the file, the line, the key and the fix; nothing downstream validates again.
+//! `rig.toml` holds the two cameras, `gripper.toml` the marks and the shape of the gripper, and `plan.toml` the result:
+//! the set-point of the on-line stage, and how it was computed. `pose.toml` and `picks.toml` give the pose of a part
+//! with a mesh. Every key is described in `docs/FILES.md`. Unknown keys, missing keys, NaN, infinity and impossible
+//! shapes are refused with the file, the line, the key and the fix; nothing downstream validates again.
 
 mod boxes;
 mod error;

@@ -23,8 +23,8 @@ pub fn keep_apart(outputs: &[(&str, Option<&Path>)], inputs: &[(&str, Option<&Pa
     Ok(())
 }
 
-/// Whether two paths name one file: by device and inode if both exist (which resolves links), otherwise by their absolute
-/// paths.
+/// Whether two paths name one file: by device and inode if both exist (which resolves links), otherwise by their
+/// absolute paths.
 fn same_file(a: &Path, b: &Path) -> bool {
     use std::os::unix::fs::MetadataExt as _;
     if let (Ok(x), Ok(y)) = (std::fs::metadata(a), std::fs::metadata(b)) {

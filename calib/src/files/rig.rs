@@ -189,8 +189,8 @@ impl RigFile {
     }
 }
 
-/// Checks the stated error of the rig. Zero would leave the gates without any allowance for the rig's error; a rig whose
-/// error exceeds the upper limits is not calibrated.
+/// Checks the stated error of the rig. Zero would leave the gates without any allowance for the rig's error; a rig
+/// whose error exceeds the upper limits is not calibrated.
 fn stated_error(src: &Source<'_>, q: &Quality) -> Result<(), FileError> {
     let values = [
         (

@@ -1,4 +1,5 @@
-//! `graspd plan --mesh`: a part with a CAD model, its pose, a rig and a gripper in; handles, plan, overlay and report out.
+//! `graspd plan --mesh`: a part with a CAD model, its pose, a rig and a gripper in; handles, plan, overlay and report
+//! out.
 
 mod inputs;
 mod request;

@@ -8,8 +8,8 @@ use graspd_rt::gripper::MAX_MARKS;
 use std::path::Path;
 
 impl PlanFile {
-    /// Reads a plan file and checks its form, ranges and seal. [`PlanFile::load_for`] also checks it against a rig and a
-    /// gripper.
+    /// Reads a plan file and checks its form, ranges and seal. [`PlanFile::load_for`] also checks it against a rig and
+    /// a gripper.
     ///
     /// # Errors
     /// Names the file, the line, the key and the fix.

@@ -29,7 +29,8 @@ pub struct PlanFile {
     pub handle: String,
     /// Jaw opening at the grasp, metres.
     pub opening_m: f64,
-    /// `(max - min) / max` of the visibility over the free angle; below 0.05 the visibility does not determine the angle.
+    /// `(max - min) / max` of the visibility over the free angle; below 0.05 the visibility does not determine the
+    /// angle.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub flatness: Option<f64>,
     /// Warnings for the operator, to be read before arming.

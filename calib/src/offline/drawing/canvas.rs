@@ -193,8 +193,8 @@ impl Canvas {
 
     /// The canvas as a PNG file.
     pub fn png(&self) -> Option<Vec<u8>> {
-        // The pixels are opaque, so there is no alpha channel. Fast compression takes a tenth of the time for a fifth more
-        // bytes.
+        // The pixels are opaque, so there is no alpha channel. Fast compression takes a tenth of the time for a fifth
+        // more bytes.
         let opaque: Vec<u8> = self.pixmap.pixels().iter().flat_map(|p| [p.red(), p.green(), p.blue()]).collect();
         let mut file = Vec::new();
         PngEncoder::new_with_quality(&mut file, CompressionType::Fast, FilterType::Adaptive)

@@ -1,5 +1,5 @@
-//! The overlay of a plan on a rim, as in figure 7 of the paper: both views, the contour and its ellipse, the normal of the
-//! plane, the predicted gripper and marks.
+//! The overlay of a plan on a rim, as in figure 7 of the paper: both views, the contour and its ellipse, the normal of
+//! the plane, the predicted gripper and marks.
 
 use super::canvas::{Canvas, Face, Rgba};
 use super::panel::{BRIGHT, DIM, EDGE, MARK, NORMAL, Panel, REJECT, RIM, boxes};

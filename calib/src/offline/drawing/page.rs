@@ -63,7 +63,8 @@ pub(in crate::offline) fn path_row(h: &mut String, path: Option<&PathRecord>) {
     }
 }
 
-/// The section with the 95 % ellipses of centre and normal; `note` says what they are of. Without a covariance, the reason.
+/// The section with the 95 % ellipses of centre and normal; `note` says what they are of. Without a covariance, the
+/// reason.
 pub(in crate::offline) fn uncertainty(
     h: &mut String,
     note: &str,

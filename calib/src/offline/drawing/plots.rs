@@ -81,7 +81,8 @@ impl Cross {
     pub(in crate::offline) const WIDTH: f64 = 560.0;
     const HEIGHT: f64 = 300.0;
 
-    /// `label` is the description for screen readers, `largest` the largest value to show, `digits` the decimals of the ticks.
+    /// `label` is the description for screen readers, `largest` the largest value to show, `digits` the decimals of the
+    /// ticks.
     pub(in crate::offline) fn new(label: &str, largest: f64, digits: usize) -> Self {
         let (w, h) = (Self::WIDTH, Self::HEIGHT);
         let scale = 0.5 * (h - 40.0) / largest;

@@ -1,5 +1,5 @@
-//! The report of a plan on a rim, one HTML page without external resources: overlay, values, residuals along the contours,
-//! uncertainty, candidates.
+//! The report of a plan on a rim, one HTML page without external resources: overlay, values, residuals along the
+//! contours, uncertainty, candidates.
 
 use super::page::{escape, head, path_row, row, uncertainty, visibility_cells};
 use super::plots::residual_plot;

@@ -11,16 +11,16 @@ const PANEL: Rgba = [22, 27, 34, 255];
 /// A column of names and values.
 pub(in crate::offline) type Column = Vec<(&'static str, String)>;
 
-/// The zoom of the images and the unit of strokes and letters, canvas pixels. A view becomes about 1100 pixels wide; the zoom
-/// has steps of one half, so that all image pixels have nearly the same size.
+/// The zoom of the images and the unit of strokes and letters, canvas pixels. A view becomes about 1100 pixels wide;
+/// the zoom has steps of one half, so that all image pixels have nearly the same size.
 pub(in crate::offline) fn scales(images: [&GreyImage; 2]) -> (f64, f64) {
     let widest = images[0].width().max(images[1].width()) as f64;
     let zoom = ((2.0 * 1100.0 / widest).round() / 2.0).clamp(0.5, 4.0);
     (zoom, (widest * zoom / 1100.0).max(0.6))
 }
 
-/// Puts panels side by side under a legend, with columns of values and the warnings below. Returns the bytes of a PNG file;
-/// `None` if it would be too large.
+/// Puts panels side by side under a legend, with columns of values and the warnings below. Returns the bytes of a PNG
+/// file; `None` if it would be too large.
 pub(in crate::offline) fn sheet(
     panels: &[Canvas],
     unit: f64,

@@ -18,7 +18,8 @@ pub const MIN_MARKS: usize = 4;
 pub struct Approach {
     /// Distance of the pre-grasp from the object's centre along the normal, metres.
     pub pregrasp_standoff: f64,
-    /// Distance of the grasp from the object's centre along the normal, metres: 0 puts the finger tips into the rim's plane.
+    /// Distance of the grasp from the object's centre along the normal, metres: 0 puts the finger tips into the rim's
+    /// plane.
     pub grasp_standoff: f64,
     /// Clearance between each finger and the object before closing, metres.
     pub clearance: f64,
@@ -130,7 +131,8 @@ impl Candidate {
     }
 }
 
-/// The object frame: origin at the centre, z along the normal, x along the major axis (for a circle, `e1` of [`frame_of`]).
+/// The object frame: origin at the centre, z along the normal, x along the major axis (for a circle, `e1` of
+/// [`frame_of`]).
 pub fn object_frame(r: &Reconstruction) -> Pose {
     let f = frame_of(&r.rim.normal);
     let x = if r.is_round() { f.column(0).into_owned() } else { r.rim.axis_a };
@@ -142,8 +144,8 @@ pub fn object_frame(r: &Reconstruction) -> Pose {
 /// Chooses the grasp on a reconstructed rim by the visibility of the marks (paper section 3.2).
 ///
 /// # Errors
-/// The rim is outside the range of the jaws, too few marks are visible, or every grasp is rotated too far from the present
-/// pose.
+/// The rim is outside the range of the jaws, too few marks are visible, or every grasp is rotated too far from the
+/// present pose.
 pub fn choose(
     rig: &Rig,
     gripper: &GripperFile,
@@ -212,7 +214,8 @@ impl Finder<'_> {
         let step = TAU / GRID as f64;
         let grid: Vec<Candidate> = (0..GRID).map(|k| self.candidate(&scene, k as f64 * step, opening)).collect();
         let allowed = |p: &&Candidate| !self.too_far(p);
-        // Angles with enough marks in both views come first, for the stacked loop; then those with all marks in this view.
+        // Angles with enough marks in both views come first, for the stacked loop; then those with all marks in this
+        // view.
         let rank = |p: &Candidate, v: usize| {
             let both = p.visibility(0) > 0.0 && p.visibility(1) > 0.0;
             let all = p.seen.get(v).is_some_and(|n| *n == self.gripper.gripper.marks.len());

@@ -1,7 +1,7 @@
 //! Grasps of a parallel gripper on a rim (paper section 3.2): four positions on an ellipse, one free angle on a circle.
 //!
-//! Gripper frame: z along the approach, which is minus the rim's normal; x along the closing direction; origin on the axis
-//! of the rim.
+//! Gripper frame: z along the approach, which is minus the rim's normal; x along the closing direction; origin on the
+//! axis of the rim.
 
 pub mod grasp;
 pub mod setpoint;
@@ -19,8 +19,8 @@ pub const FLAT: f64 = 0.05;
 /// Steps of the global search over the free angle: half a degree each, refined by a parabola.
 const GRID: usize = 720;
 
-/// Gripper pose whose closing direction is `x` projected to the rim's plane, at `standoff` from the rim's centre along its
-/// normal.
+/// Gripper pose whose closing direction is `x` projected to the rim's plane, at `standoff` from the rim's centre along
+/// its normal.
 pub fn gripper_pose(rim: &Rim, x: &Vector3<f64>, standoff: f64) -> Isometry3<f64> {
     let z = -rim.normal;
     let x = (x - z * z.dot(x)).normalize();
@@ -72,7 +72,8 @@ pub fn grasp_circle(rim: &Rim, marks: &[FlatMark], cameras: &[PinholeCamera; 2],
     CircleGrasp { per_camera, camera, phi, pose: gripper_pose(rim, &direction(rim, phi), standoff) }
 }
 
-/// The angle with the largest visibility for one camera, among the angles at which all marks are visible, if there are any.
+/// The angle with the largest visibility for one camera, among the angles at which all marks are visible, if there are
+/// any.
 pub fn free_angle(rim: &Rim, marks: &[FlatMark], camera: &PinholeCamera, standoff: f64) -> FreeAngle {
     let step = TAU / GRID as f64;
     let at = |phi: f64| visibility(&gripper_pose(rim, &direction(rim, phi), standoff), marks, camera);
@@ -118,8 +119,8 @@ pub struct EllipseGrasp {
     pub feasible: [bool; 2],
 }
 
-/// The four grasps that align the gripper with the axes of an ellipse. `half_widths` are those that the jaws must span: the
-/// semi-axes, plus the radius of a bar.
+/// The four grasps that align the gripper with the axes of an ellipse. `half_widths` are those that the jaws must span:
+/// the semi-axes, plus the radius of a bar.
 pub fn grasp_ellipse(
     rim: &Rim,
     half_widths: (f64, f64),

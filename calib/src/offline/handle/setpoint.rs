@@ -1,8 +1,8 @@
 //! The marks at a goal: which of them are visible in each view, their solid angles and their pixels.
 //!
-//! A mark is visible if its incidence is at most 80 degrees, its centre is in the image with a margin, and neither the boxes
-//! of the gripper nor the object occlude it. Its visibility is the solid angle of its disc (paper section 3.2); that of an
-//! occluded mark is 0.
+//! A mark is visible if its incidence is at most 80 degrees, its centre is in the image with a margin, and neither the
+//! boxes of the gripper nor the object occlude it. Its visibility is the solid angle of its disc (paper section 3.2);
+//! that of an occluded mark is 0.
 
 use crate::files::{GripperFile, OrientedBox};
 use crate::offline::handle::visibility::{BORDER_PX, MIN_COSINE, solid_angle};
@@ -11,8 +11,8 @@ use graspd_rt::gripper::{MAX_MARKS, Mark};
 use graspd_rt::setpoint::Goal;
 use nalgebra::Point3;
 
-/// Longest part of a line of sight inside a box that does not occlude the mark, metres: a mark lies on the surface of its
-/// own box.
+/// Longest part of a line of sight inside a box that does not occlude the mark, metres: a mark lies on the surface of
+/// its own box.
 const MAX_GRAZE_M: f64 = 1e-3;
 
 /// A solid object that may occlude marks, in the left camera's frame.
@@ -160,7 +160,8 @@ struct CameraCentre {
     in_boxes: Vec<Vec3>,
 }
 
-/// Interpolates between two poses: the position along a straight line, the orientation about one axis. `fraction` is 0 to 1.
+/// Interpolates between two poses: the position along a straight line, the orientation about one axis. `fraction` is 0
+/// to 1.
 pub fn between(a: &Pose, b: &Pose, fraction: f64) -> Pose {
     let t = a.translation.vector.lerp(&b.translation.vector, fraction);
     // Orientations half a turn apart have no unique shortest rotation; use the second one.

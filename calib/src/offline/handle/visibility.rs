@@ -1,5 +1,5 @@
-//! Visibility of marks: the sum of their solid angles. Paper section 3.2 names the criterion without a formula; here it is
-//! that of small flat marks. Lengths are in the unit of the projection matrices; there is no lens distortion.
+//! Visibility of marks: the sum of their solid angles. Paper section 3.2 names the criterion without a formula; here it
+//! is that of small flat marks. Lengths are in the unit of the projection matrices; there is no lens distortion.
 
 use crate::offline::rim::cone::{camera_centre, depth, project};
 use crate::offline::rim::model::Projection;
@@ -34,14 +34,15 @@ impl PinholeCamera {
     }
 }
 
-/// Smallest cosine between a mark's normal and its viewing direction: at more than 80 degrees a mark counts as not visible.
+/// Smallest cosine between a mark's normal and its viewing direction: at more than 80 degrees a mark counts as not
+/// visible.
 pub const MIN_COSINE: f64 = 0.173_648_177_666_930_33;
 
 /// Smallest distance of a visible mark from the image border, pixels.
 pub const BORDER_PX: f64 = 10.0;
 
-/// Solid angle of a small flat mark seen from `viewpoint`, steradians: `area max(0, cos) / d^2`. The exact value of a disc of
-/// 12 mm at 1.4 m differs by less than 0.1 %.
+/// Solid angle of a small flat mark seen from `viewpoint`, steradians: `area max(0, cos) / d^2`. The exact value of a
+/// disc of 12 mm at 1.4 m differs by less than 0.1 %.
 pub fn solid_angle(centre: &Vector3<f64>, normal: &Vector3<f64>, area: f64, viewpoint: &Vector3<f64>) -> f64 {
     let v = viewpoint - centre;
     let d = v.norm();
@@ -61,8 +62,8 @@ pub fn visibility(world_from_gripper: &Isometry3<f64>, marks: &[FlatMark], camer
     (sum, all)
 }
 
-/// Whether a mark's incidence is at most 80 degrees ([`MIN_COSINE`]) and its centre is in the image, [`BORDER_PX`] from its
-/// border.
+/// Whether a mark's incidence is at most 80 degrees ([`MIN_COSINE`]) and its centre is in the image, [`BORDER_PX`] from
+/// its border.
 pub fn is_visible(x: &Vector3<f64>, normal: &Vector3<f64>, camera: &PinholeCamera) -> bool {
     let v = (camera.centre - x).normalize();
     let u: Vector2<f64> = project(&camera.p, x);

@@ -64,8 +64,8 @@ impl<'a> Bvh<'a> {
         tree
     }
 
-    /// Calls `hit` with the triangles of all leaves whose ancestors' boxes satisfy `meets`, until it returns true. Returns
-    /// whether it did.
+    /// Calls `hit` with the triangles of all leaves whose ancestors' boxes satisfy `meets`, until it returns true.
+    /// Returns whether it did.
     fn walk(&self, meets: &dyn Fn(&Vec3, &Vec3) -> bool, hit: &mut dyn FnMut(usize) -> bool) -> bool {
         let mut todo = vec![0usize];
         while let Some(k) = todo.pop() {
@@ -95,8 +95,8 @@ impl<'a> Bvh<'a> {
 
     /// Whether a box touches any triangle during a straight motion by `travel` from its position.
     ///
-    /// Exact for any orientation of the box: the swept volume is a convex body with known separating axes, not a series of
-    /// samples.
+    /// Exact for any orientation of the box: the swept volume is a convex body with known separating axes, not a series
+    /// of samples.
     pub fn touches_sweep(&self, b: &OrientedBox, travel: &Vec3) -> bool {
         let r = b.frame_from_box.rotation.to_rotation_matrix();
         let mut body = Zonotope {
@@ -136,7 +136,8 @@ impl<'a> Bvh<'a> {
         2 * inside > RAYS.len() + 1
     }
 
-    /// Whether a point is inside the closed surface of the triangles that `counts` selects, by the parity of ray crossings.
+    /// Whether a point is inside the closed surface of the triangles that `counts` selects, by the parity of ray
+    /// crossings.
     pub fn odd(&self, p: &Vec3, counts: impl Fn(u32) -> bool) -> bool {
         let odd = |d: &[f64; 3]| {
             let mut n = 0;
@@ -165,8 +166,8 @@ impl<'a> Bvh<'a> {
         first.map(|f| f.1)
     }
 
-    /// Calls `hit` for every crossing of a ray, with the triangle, the distance in lengths of `d`, and whether the ray leaves
-    /// the solid there according to the triangle's normal.
+    /// Calls `hit` for every crossing of a ray, with the triangle, the distance in lengths of `d`, and whether the ray
+    /// leaves the solid there according to the triangle's normal.
     fn ray(&self, p: &Vec3, d: &Vec3, mut hit: impl FnMut(u32, f64, bool)) {
         let inverse = d.map(|x| 1.0 / x);
         let meets = |lo: &Vec3, hi: &Vec3| {
@@ -214,7 +215,8 @@ impl<'a> Bvh<'a> {
     }
 }
 
-/// Directions of the rays that vote on inside and outside. None is parallel to an axis: faces and edges of parts often are.
+/// Directions of the rays that vote on inside and outside. None is parallel to an axis: faces and edges of parts often
+/// are.
 const RAYS: [[f64; 3]; 7] = [
     [0.5773, 0.5431, 0.6092],
     [-0.8137, 0.3391, 0.4724],
@@ -225,13 +227,14 @@ const RAYS: [[f64; 3]; 7] = [
     [0.7411, -0.4337, -0.5129],
 ];
 
-/// The crossing of the line `p + s d` with a triangle: `s`, and the determinant, which is negative if `d` points along the
-/// normal.
+/// The crossing of the line `p + s d` with a triangle: `s`, and the determinant, which is negative if `d` points along
+/// the normal.
 fn crossing(p: &Vec3, d: &Vec3, [a, b, c]: &[Vec3; 3]) -> Option<(f64, f64)> {
     let (e1, e2) = (b - a, c - a);
     let h = d.cross(&e2);
     let det = e1.dot(&h);
-    // Relative to the lengths that enter the determinant, so that the small triangles of a fine scan are not degenerate.
+    // Relative to the lengths that enter the determinant, so that the small triangles of a fine scan are not
+    // degenerate.
     if det.abs() < 1e-12 * e1.norm() * e2.norm() * d.norm() {
         return None;
     }
@@ -265,14 +268,15 @@ impl Zonotope {
         self.half.iter().map(|h| h.dot(axis).abs()).sum()
     }
 
-    /// Whether no face of it separates it from an axis-parallel box: a conservative test that may return true for a box that
-    /// it does not meet.
+    /// Whether no face of it separates it from an axis-parallel box: a conservative test that may return true for a box
+    /// that it does not meet.
     fn meets_box(&self, centre: &Vec3, half: &Vec3) -> bool {
         let d = centre - self.centre;
         self.axes.iter().all(|a| d.dot(a).abs() <= self.reach(a) + half.dot(&a.abs()))
     }
 
-    /// Separating-axis test: two convex bodies touch if none of the face normals and edge cross products separates them.
+    /// Separating-axis test: two convex bodies touch if none of the face normals and edge cross products separates
+    /// them.
     fn touches(&self, t: &[Vec3; 3]) -> bool {
         let t = t.map(|v| v - self.centre);
         let separates = |axis: &Vec3| {

@@ -45,13 +45,13 @@ pub enum Rejection {
     },
     /// The contact area of the claws is too small.
     #[error(
-        "the contact is {contact_mm2:.0} mm2 per claw, but {least_mm2:.0} mm2 are required: the faces are too small, or deeper than the fingers reach"
+        "the contact is {contact_mm2:.0} mm2 per claw, but {required_mm2:.0} mm2 are required: the faces are too small, or deeper than the fingers reach"
     )]
     Contact {
         /// Contact area of each claw, square millimetres.
         contact_mm2: f64,
         /// Required contact area, square millimetres.
-        least_mm2: f64,
+        required_mm2: f64,
     },
     /// The gripper would collide with the part.
     #[error("the {what} would collide with the part")]

@@ -39,8 +39,8 @@ pub struct Face {
 
 /// Smallest cosine between the normals of two adjacent regions that are one face found in two pieces: 3 degrees.
 const MIN_COS_SAME_PLANE: f64 = 0.9986;
-/// Smallest cosine between a face's normal and that of a triangle in its plane that belongs to it: 50 degrees, because the
-/// normals of a scan are noisy.
+/// Smallest cosine between a face's normal and that of a triangle in its plane that belongs to it: 50 degrees, because
+/// the normals of a scan are noisy.
 const MIN_COS_SAME_SIDE: f64 = 0.643;
 /// Smallest cosine between the normal of a face and the reversed normal of its partner: 6 degrees, as for a handle.
 const MIN_COS_PARTNER: f64 = 0.9945;
@@ -89,8 +89,8 @@ pub fn faces(mesh: &Mesh, tree: &Bvh<'_>, flat: &Flatness) -> Vec<Face> {
             assign(&mut owner, &grown, regions.len() as u32);
             continue;
         }
-        // The triangles of a small region stay free for a larger one with a later seed. Seeds near this one would give the
-        // same region again.
+        // The triangles of a small region stay free for a larger one with a later seed. Seeds near this one would give
+        // the same region again.
         let from = get(&g.centre, seed);
         let near = 0.09 * area / std::f64::consts::PI;
         for t in &grown {
@@ -155,8 +155,8 @@ impl Ground {
         Self { links, normal, vector, centre, needle, noisy, distance, cos: flat.angle.cos() }
     }
 
-    /// Seeds in the order in which they are tried: flat neighbourhoods first, because a seed on a rounded edge would take
-    /// triangles from two faces; then large triangles before small ones.
+    /// Seeds in the order in which they are tried: flat neighbourhoods first, because a seed on a rounded edge would
+    /// take triangles from two faces; then large triangles before small ones.
     fn seeds(&self) -> Vec<u32> {
         let n = self.normal.len() as u32;
         let rough = |t: u32| {
@@ -170,8 +170,9 @@ impl Ground {
         seeds.into_iter().map(|s| s.2).collect()
     }
 
-    /// Grows a region from a seed over triangles without an owner. The normal of its plane is `fixed`, or the mean normal of
-    /// the region. `stamp` holds the number of the last region that reached each triangle; `mark` is that of this one.
+    /// Grows a region from a seed over triangles without an owner. The normal of its plane is `fixed`, or the mean
+    /// normal of the region. `stamp` holds the number of the last region that reached each triangle; `mark` is that of
+    /// this one.
     fn grow(&self, seed: u32, owner: &[u32], stamp: &mut [u32], mark: u32, fixed: Option<Vec3>) -> Vec<u32> {
         let (mut plane_n, mut plane_c) = (fixed.unwrap_or(get(&self.normal, seed)), get(&self.centre, seed));
         let (mut sum_n, mut sum_c, mut sum_a) = (Vec3::zeros(), Vec3::zeros(), 0.0);
@@ -186,7 +187,8 @@ impl Ground {
             sum_n += get(&self.normal, t) * a;
             sum_c += get(&self.centre, t) * a;
             sum_a += a;
-            // The plane follows the region while it is small, then stays: otherwise the region follows a curved surface.
+            // The plane follows the region while it is small, then stays: otherwise the region follows a curved
+            // surface.
             if fixed.is_none() && out.len().is_power_of_two() && out.len() <= 4096 {
                 if let Some(n) = sum_n.try_normalize(1e-300) {
                     plane_n = n;
@@ -212,8 +214,8 @@ impl Ground {
         out
     }
 
-    /// The face of a set of triangles. The sum of their area vectors depends on their common outline only, so that the noise
-    /// of a scan cancels.
+    /// The face of a set of triangles. The sum of their area vectors depends on their common outline only, so that the
+    /// noise of a scan cancels.
     fn face(&self, mut triangles: Vec<u32>) -> Option<Face> {
         triangles.sort_unstable();
         let (mut sum_n, mut sum_c, mut sum_a) = (Vec3::zeros(), Vec3::zeros(), 0.0);
@@ -271,8 +273,8 @@ impl Ground {
         groups.into_iter().filter(|g| !g.is_empty()).filter_map(|g| self.face(g)).collect()
     }
 
-    /// Curved walls are split into strips that depend on the seeds, so the strips of two opposite walls do not match. For
-    /// each face without a partner (an opposed face behind its centre), grows that partner.
+    /// Curved walls are split into strips that depend on the seeds, so the strips of two opposite walls do not match.
+    /// For each face without a partner (an opposed face behind its centre), grows that partner.
     fn partners(&self, tree: &Bvh<'_>, found: &[Face], flat: &Flatness) -> Vec<Face> {
         let mut out: Vec<Face> = Vec::new();
         let mut stamp = vec![0u32; self.normal.len()];
@@ -304,12 +306,13 @@ impl Ground {
         out
     }
 
-    /// Adds to the faces of a scan all connected triangles in their planes, for any normal: near edges and in noise a normal
-    /// means little. A triangle may then belong to two adjacent faces. Faces found twice are left out.
+    /// Adds to the faces of a scan all connected triangles in their planes, for any normal: near edges and in noise a
+    /// normal means little. A triangle may then belong to two adjacent faces. Faces found twice are left out.
     fn complete(&self, mesh: &Mesh, mut found: Vec<Face>) -> Vec<Face> {
         found.sort_by(|a, b| b.area.total_cmp(&a.area));
         let n = mesh.triangles.len();
-        // For each triangle, the last face that reached it, counted from 1, and the last one whose normal it agrees with.
+        // For each triangle, the last face that reached it, counted from 1, and the last one whose normal it agrees
+        // with.
         let (mut reached, mut held) = (vec![0u32; n], vec![0u32; n]);
         let mut out: Vec<Face> = Vec::new();
         for f in found {

@@ -123,8 +123,8 @@ fn assess_one(
     assessed
 }
 
-/// Tests rotation, reach and visibility for the two orientations of a placement, half a turn apart: they are equivalent for
-/// parallel claws, but not for the marks and the arm.
+/// Tests rotation, reach and visibility for the two orientations of a placement, half a turn apart: they are equivalent
+/// for parallel claws, but not for the marks and the arm.
 fn test_rotation_reach_and_visibility(
     from: &Assessed,
     placements: &[Placement],

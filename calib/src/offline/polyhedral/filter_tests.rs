@@ -95,8 +95,8 @@ fn assessed(corners: Vec<[Vec3; 3]>, g: &GripperFile) -> Vec<Assessed> {
     all
 }
 
-/// Whether a box collides with a mesh, without the hierarchy: a sample of the surface is inside the box, or a sample of the
-/// box is inside the solid.
+/// Whether a box collides with a mesh, without the hierarchy: a sample of the surface is inside the box, or a sample of
+/// the box is inside the solid.
 fn sampled_collision(mesh: &Mesh, b: &OrientedBox, seed: i32) -> bool {
     use rand::{RngExt, SeedableRng};
     let inverse = b.frame_from_box.inverse();
@@ -142,7 +142,8 @@ fn sampled_collision(mesh: &Mesh, b: &OrientedBox, seed: i32) -> bool {
         })
 }
 
-/// Tests placements of the dropped handles on a grid of half a millimetre: if one is free, the handle was dropped wrongly.
+/// Tests placements of the dropped handles on a grid of half a millimetre: if one is free, the handle was dropped
+/// wrongly.
 fn nothing_missed(found: &Handles, tree: &Bvh<'_>, g: &GripperFile, s: &Constraints<'_>, all: &[Assessed]) {
     let claw = &g.fingers[0].closed;
     let (half, beyond) = (claw.half.y, claw.frame_from_box.translation.z + claw.half.z);

@@ -1,7 +1,7 @@
 //! All box handles of a mesh: two opposed faces, their overlap, and the approach directions.
 //!
-//! This is the exhaustive enumeration of paper section 3.1. It assumes parallel claws and nothing else of the gripper, so it
-//! is done once for a part.
+//! This is the exhaustive enumeration of paper section 3.1. It assumes parallel claws and nothing else of the gripper,
+//! so it is done once for a part.
 
 use super::faces::Face;
 use super::mesh::Mesh;
@@ -116,8 +116,8 @@ pub fn enumerate(mesh: &Mesh, faces: &[Face], opposition: &Opposition) -> Handle
     out
 }
 
-/// The connected overlaps of two faces with at least `min_area`, each with its approach directions. `edges` are the boundary
-/// edges of both faces.
+/// The connected overlaps of two faces with at least `min_area`, each with its approach directions. `edges` are the
+/// boundary edges of both faces.
 fn overlaps(
     mesh: &Mesh,
     faces: [&Face; 2],
@@ -193,12 +193,12 @@ const MIN_SIDE_M: f64 = 4e-3;
 const MIN_SIDE: f64 = 0.08;
 /// A side with at least this fraction of the extent needs no minimum length: it is the end of a thin plate.
 const FULL_SIDE: f64 = 0.25;
-/// A side that deviates from a right angle to the longest side by less is treated as perpendicular, radians (10 degrees, the
-/// error from the ragged corners of a scan).
+/// A side that deviates from a right angle to the longest side by less is treated as perpendicular, radians (10
+/// degrees, the error from the ragged corners of a scan).
 const NEARLY_SQUARE_RAD: f64 = 0.175;
 
-/// Approach directions of claws: inwards across each side of the overlap's outline. `edges` are the straight boundary edges
-/// of the faces.
+/// Approach directions of claws: inwards across each side of the overlap's outline. `edges` are the straight boundary
+/// edges of the faces.
 fn approaches(o: &Overlap, sides: &[[[f64; 2]; 2]], edges: &[[f64; 2]]) -> Vec<Vec3> {
     let difference = |a: f64, b: f64| (a - b + PI).rem_euclid(TAU) - PI;
     // Directions of the sides, with the inside to the left, and their lengths; longest first.
@@ -232,8 +232,8 @@ fn approaches(o: &Overlap, sides: &[[[f64; 2]; 2]], edges: &[[f64; 2]]) -> Vec<V
         }
         (total > 0.5 * length).then(|| angle + sum / total)
     };
-    // A handle is a box: a side that is nearly perpendicular to the longest one is taken as perpendicular, unless a straight
-    // edge determines its direction.
+    // A handle is a box: a side that is nearly perpendicular to the longest one is taken as perpendicular, unless a
+    // straight edge determines its direction.
     let main = merged.first().map_or(0.0, |(angle, length)| exact(*angle, *length).unwrap_or(*angle));
     let square = |angle: f64| {
         let off = (angle - main + 0.5 * FRAC_PI_2).rem_euclid(FRAC_PI_2) - 0.5 * FRAC_PI_2;

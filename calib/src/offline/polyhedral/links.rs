@@ -1,4 +1,5 @@
-//! Adjacency of triangles, also where they share no edge: across cracks, and where one long edge meets several short ones.
+//! Adjacency of triangles, also where they share no edge: across cracks, and where one long edge meets several short
+//! ones.
 
 use super::bvh::Bvh;
 use super::mesh::Mesh;
@@ -40,8 +41,8 @@ impl Links {
                 }
             }
         }
-        // A triangle that touches the middle of an open edge is a neighbour. If a long edge meets short ones, the middles of
-        // the short ones are on the long one.
+        // A triangle that touches the middle of an open edge is a neighbour. If a long edge meets short ones, the
+        // middles of the short ones are on the long one.
         let gap = MAX_CRACK * mesh.size().norm();
         let vertex = |k: u32| mesh.vertices.get(k as usize).copied().unwrap_or_default();
         for (p, q, t) in open.iter().take(MAX_OPEN_EDGES) {

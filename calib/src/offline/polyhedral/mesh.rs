@@ -14,8 +14,8 @@ pub struct Mesh {
 }
 
 impl Mesh {
-    /// Builds a mesh from separate triangles by merging equal corners. Degenerate triangles, duplicates and triangles with
-    /// corners that are not finite are left out. `None` if no triangle is left.
+    /// Builds a mesh from separate triangles by merging equal corners. Degenerate triangles, duplicates and triangles
+    /// with corners that are not finite are left out. `None` if no triangle is left.
     pub fn from_corners(corners: impl IntoIterator<Item = [Vec3; 3]>) -> Option<Self> {
         let all: Vec<[Vec3; 3]> = corners
             .into_iter()
@@ -84,7 +84,8 @@ struct Weld {
 }
 
 impl Weld {
-    /// Side of a grid cell in units of `near`: most corners are farther than `near` from its border, so one cell is searched.
+    /// Side of a grid cell in units of `near`: most corners are farther than `near` from its border, so one cell is
+    /// searched.
     const CELL: f64 = 16.0;
 
     fn new(lo: Vec3, hi: Vec3) -> Self {

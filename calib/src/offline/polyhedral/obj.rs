@@ -88,8 +88,8 @@ pub(super) fn read(bytes: &[u8]) -> Result<Vec<[Vec3; 3]>, Problem> {
     Ok(out)
 }
 
-/// Triangulates a polygon by ear clipping, which is correct for concave outlines too; a fan would cover area outside them.
-/// `None` if the outline crosses itself.
+/// Triangulates a polygon by ear clipping, which is correct for concave outlines too; a fan would cover area outside
+/// them. `None` if the outline crosses itself.
 fn triangulate(corners: &[Vec3], out: &mut Vec<[Vec3; 3]>) -> Option<()> {
     if let [a, b, c] = corners {
         out.push([*a, *b, *c]);

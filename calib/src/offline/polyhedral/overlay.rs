@@ -1,4 +1,5 @@
-//! The overlay of a plan on a mesh: both views, the projected edges of the mesh, the predicted gripper and marks, the picks.
+//! The overlay of a plan on a mesh: both views, the projected edges of the mesh, the predicted gripper and marks, the
+//! picks.
 
 use super::mesh::Mesh;
 use super::plan::{MeshPlan, Placed, Survey};
@@ -23,8 +24,8 @@ struct Line {
     hidden: bool,
 }
 
-/// Draws a plan. Without images the views are grey. Returns the bytes of a PNG file; `None` if the images are too large to
-/// draw.
+/// Draws a plan. Without images the views are grey. Returns the bytes of a PNG file; `None` if the images are too large
+/// to draw.
 pub fn draw(
     plan: &MeshPlan,
     survey: &Survey<'_>,

@@ -10,8 +10,8 @@ use std::f64::consts::PI;
 
 /// Smallest distance between the palm and the part, metres.
 const MIN_PALM_GAP_M: f64 = 1e-3;
-/// Largest gap between each claw and its face at the end of the closing test, metres: down to it the claws must not touch
-/// anything.
+/// Largest gap between each claw and its face at the end of the closing test, metres: down to it the claws must not
+/// touch anything.
 const CLOSING_GAP_M: f64 = 0.5e-3;
 /// Tolerance of width comparisons, metres: mesh files have single precision.
 const WIDTH_TOLERANCE_M: f64 = 1e-6;
@@ -112,8 +112,8 @@ impl<'a> PlacementSearch<'a> {
         Self { handle, overlap, tree, gripper, claw, s, across, rotation }
     }
 
-    /// The pose whose origin has these coordinates from the overlap's origin: across the approach, along the approach, along
-    /// the closing direction, metres. `turned` adds half a turn about the approach.
+    /// The pose whose origin has these coordinates from the overlap's origin: across the approach, along the approach,
+    /// along the closing direction, metres. `turned` adds half a turn about the approach.
     fn pose(&self, side: f64, depth: f64, off: f64, turned: bool) -> Pose {
         let at = self.overlap.origin + self.across * side + self.handle.approach * depth + self.handle.closing * off;
         let half = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), if turned { PI } else { 0.0 });
@@ -125,8 +125,9 @@ impl<'a> PlacementSearch<'a> {
         self.pose(0.0, 0.0, 0.0, false)
     }
 
-    /// Calls `take` with the collision-free placements until it returns true. Placements with the best contact come first:
-    /// near the centre before near the ends, deep before shallow. The slice has up to two placements, half a turn apart.
+    /// Calls `take` with the collision-free placements until it returns true. Placements with the best contact come
+    /// first: near the centre before near the ends, deep before shallow. The slice has up to two placements, half a
+    /// turn apart.
     ///
     /// # Errors
     /// No placement is free of collisions: the reason, the best contact and the pose at which the last test failed.
@@ -166,9 +167,9 @@ impl<'a> PlacementSearch<'a> {
         if any {
             return Ok(());
         }
-        let least = self.s.contact;
+        let required = self.s.contact;
         Err(failed.unwrap_or_else(|| {
-            (Rejection::Contact { contact_mm2: most * 1e6, least_mm2: least * 1e6 }, most, self.middle())
+            (Rejection::Contact { contact_mm2: most * 1e6, required_mm2: required * 1e6 }, most, self.middle())
         }))
     }
 
@@ -202,8 +203,8 @@ impl<'a> PlacementSearch<'a> {
         Ok(())
     }
 
-    /// Positions across the approach to test, nearest to the centre first: a coarse set with steps of a quarter of a claw's
-    /// width, and the positions between them, for handles where no coarse position is free.
+    /// Positions across the approach to test, nearest to the centre first: a coarse set with steps of a quarter of a
+    /// claw's width, and the positions between them, for handles where no coarse position is free.
     fn sides(&self, cells: &[Cell]) -> (Vec<f64>, Vec<f64>) {
         let n = cells.len().max(1) as f64;
         let middle = cells.iter().map(|c| c.side).sum::<f64>() / n;
@@ -220,7 +221,8 @@ impl<'a> PlacementSearch<'a> {
         (coarse, fine)
     }
 
-    /// The deepest free placement on a strip of cells sorted by depth; `None` if the contact is too small at every depth.
+    /// The deepest free placement on a strip of cells sorted by depth; `None` if the contact is too small at every
+    /// depth.
     fn deepest(&self, side: f64, strip: &[Cell], turned: bool, most: &mut f64) -> Option<Result<Placement, Failed>> {
         let half = 0.5 * self.overlap.cell;
         let area = self.overlap.cell * self.overlap.cell;
@@ -293,9 +295,9 @@ fn rank(r: &Rejection) -> u8 {
     }
 }
 
-/// The part of the gripper that collides with the mesh, or comes nearer to it than half the clearance (at most 0.5 mm): at a
-/// pose or along the straight approach, with the jaws open to the first width, or at the pose while the fingers close to the
-/// second. Widths in metres.
+/// The part of the gripper that collides with the mesh, or comes nearer to it than half the clearance (at most 0.5 mm):
+/// at a pose or along the straight approach, with the jaws open to the first width, or at the pose while the fingers
+/// close to the second. Widths in metres.
 pub(super) fn collision(
     tree: &Bvh<'_>,
     gripper: &GripperFile,

@@ -304,7 +304,8 @@ impl Survey<'_> {
     }
 }
 
-/// The plan's record of a handle. Object frame: origin at the grasp, z against the approach, x along the closing direction.
+/// The plan's record of a handle. Object frame: origin at the grasp, z against the approach, x along the closing
+/// direction.
 fn object_record(chosen: &Assessed, placed: &Placed, options: &MeshOptions) -> Result<ObjectRecord, MeshPlanError> {
     let left_from_mesh = placed.left_from_mesh;
     let grasp = left_from_mesh * chosen.mesh_from_gripper;
@@ -333,7 +334,8 @@ fn object_record(chosen: &Assessed, placed: &Placed, options: &MeshOptions) -> R
     let turn = to_object.matrix() * cov_turn * to_object.matrix().transpose();
     // A small rotation w moves the normal by (w_y, -w_x) in the object frame.
     let cov_normal = nalgebra::Matrix2::new(turn[(1, 1)], -turn[(0, 1)], -turn[(0, 1)], turn[(0, 0)]);
-    // The limit applies to all three axes: a rotation about the approach moves the claws on the faces, though not the normal.
+    // The limit applies to all three axes: a rotation about the approach moves the claws on the faces, though not the
+    // normal.
     let (sigma, sigma_turn) = (worst(&cov_centre), worst(&turn));
     if !(sigma <= options.max_sigma && sigma_turn <= options.max_sigma_turn) {
         return Err(MeshPlanError::TooUncertain {

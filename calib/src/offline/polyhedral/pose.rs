@@ -22,7 +22,8 @@ pub struct MeshPose {
     pub left_from_mesh: Pose,
     /// Root mean square reprojection error over both views, pixels.
     pub rms_px: f64,
-    /// Covariance of a small body motion `[v; w]` of the mesh, metres and radians, for the observed scatter of the picks.
+    /// Covariance of a small body motion `[v; w]` of the mesh, metres and radians, for the observed scatter of the
+    /// picks.
     pub covariance: Matrix6<f64>,
 }
 
@@ -97,18 +98,19 @@ const MIN_SIGMA_PX: f64 = 0.2;
 const MAX_TRIPLES: usize = 4000;
 /// Smallest ratio of the second to the first principal variance of points that are not collinear (1/100 in lengths).
 const MIN_VARIANCE_RATIO: f64 = 1e-4;
-/// Largest relative difference between the size of the part and that of its mesh: beyond it the unit is wrong, or the part.
+/// Largest relative difference between the size of the part and that of its mesh: beyond it the unit is wrong, or the
+/// part.
 const MAX_SCALE_ERROR: f64 = 0.02;
 
-/// Fits the pose of a mesh to picked points: triangulation, Horn's closed form, then least squares on all pixels. Needs no
-/// initial value.
+/// Fits the pose of a mesh to picked points: triangulation, Horn's closed form, then least squares on all pixels. Needs
+/// no initial value.
 ///
-/// The covariance takes the pixel noise from the scatter of the picks: with `d` degrees of freedom, the sum of squares over
-/// `d - 2`, so that the mean squared Mahalanobis distance of the true pose is 6 for any number of picks.
+/// The covariance takes the pixel noise from the scatter of the picks: with `d` degrees of freedom, the sum of squares
+/// over `d - 2`, so that the mean squared Mahalanobis distance of the true pose is 6 for any number of picks.
 ///
 /// # Errors
-/// Too few or collinear picks, or picks that contradict each other by more than `limit_px`: the error names the picks that
-/// do not fit, or says that two are exchanged, that the mesh is mirrored, or that it has another size.
+/// Too few or collinear picks, or picks that contradict each other by more than `limit_px`: the error names the picks
+/// that do not fit, or says that two are exchanged, that the mesh is mirrored, or that it has another size.
 pub fn fit(rig: &Rig, picked: &[Picked], limit_px: f64) -> Result<MeshPose, PickError> {
     if picked.len() < 3 {
         return Err(PickError::TooFew(picked.len()));
@@ -262,14 +264,15 @@ fn errors(rig: &Rig, pose: &Pose, p: &Picked) -> [f64; 2] {
     residuals(rig, pose, p).map(|r| r.map_or(f64::INFINITY, |r| r.norm()))
 }
 
-/// Residuals of a pick at a pose, left and right: picked pixel minus projected point; `None` for a point behind the camera.
+/// Residuals of a pick at a pose, left and right: picked pixel minus projected point; `None` for a point behind the
+/// camera.
 pub fn residuals(rig: &Rig, left_from_mesh: &Pose, p: &Picked) -> [Option<Pixel>; 2] {
     let x = (left_from_mesh * Point3::from(p.point)).coords;
     [(View::Left, p.left), (View::Right, p.right)].map(|(view, px)| rig.project(view, &x).map(|q| px - q))
 }
 
-/// Levenberg-Marquardt on the pixels, from a pose near the solution. Returns the pose and the information matrix of a small
-/// body motion for unit pixel noise.
+/// Levenberg-Marquardt on the pixels, from a pose near the solution. Returns the pose and the information matrix of a
+/// small body motion for unit pixel noise.
 fn refine(rig: &Rig, picked: &[Picked], mut pose: Pose) -> Option<(Pose, Matrix6<f64>)> {
     let cost = |pose: &Pose| -> f64 { picked.iter().flat_map(|p| errors(rig, pose, p)).map(|e| e * e).sum() };
     let mut now = cost(&pose);

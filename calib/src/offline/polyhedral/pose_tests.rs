@@ -1,5 +1,5 @@
-//! The pose of a mesh from picks: correct from any orientation, with a consistent covariance, and a specific error for each
-//! kind of wrong picks.
+//! The pose of a mesh from picks: correct from any orientation, with a consistent covariance, and a specific error for
+//! each kind of wrong picks.
 
 use super::*;
 use graspd_rt::geom::{Camera, Distortion};

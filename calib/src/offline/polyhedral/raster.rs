@@ -73,8 +73,8 @@ impl Grid {
         [self.lo[0] + (x as f64 + 0.5) * self.cell, self.lo[1] + (y as f64 + 0.5) * self.cell]
     }
 
-    /// Height of a face over the plane in each cell, metres; the largest where it is ambiguous, the smallest for a negative
-    /// `sign`. NaN where there is no face. Small holes are filled.
+    /// Height of a face over the plane in each cell, metres; the largest where it is ambiguous, the smallest for a
+    /// negative `sign`. NaN where there is no face. Small holes are filled.
     pub(super) fn heights(&self, mesh: &Mesh, f: &Face, sign: f64) -> Vec<f64> {
         let [w, h] = self.size;
         let mut out = vec![f64::NAN; w * h];
@@ -163,8 +163,9 @@ impl Grid {
         out
     }
 
-    /// The sides of the outer outline of a component: the two ends of each in the axes of the plane, metres, with the inside
-    /// to the left. A deviation from a straight side of less than `ragged` (metres) is not a corner (Douglas-Peucker).
+    /// The sides of the outer outline of a component: the two ends of each in the axes of the plane, metres, with the
+    /// inside to the left. A deviation from a straight side of less than `ragged` (metres) is not a corner
+    /// (Douglas-Peucker).
     pub(super) fn sides(&self, part: &[usize], ragged: f64) -> Vec<[[f64; 2]; 2]> {
         let stair = MAX_STAIR_CELLS.max(ragged / self.cell);
         let outline = self.outline(part);
@@ -203,8 +204,8 @@ impl Grid {
         (0..m).map(ends).filter(|(a, b)| b > a).map(|(a, b)| self.straight(a, b, &at).map(metres)).collect()
     }
 
-    /// A least-squares line through the middle part of a piece of the outline, which averages the steps of the cells. It is
-    /// as long as the piece.
+    /// A least-squares line through the middle part of a piece of the outline, which averages the steps of the cells.
+    /// It is as long as the piece.
     fn straight(&self, a: usize, b: usize, at: &dyn Fn(usize) -> [f64; 2]) -> [[f64; 2]; 2] {
         let (p, q) = (at(a), at(b));
         let trim = (b - a) / 8;

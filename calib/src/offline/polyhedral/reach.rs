@@ -1,7 +1,7 @@
 //! Whether the arm can move the gripper to a handle along a straight approach.
 //!
-//! This needs the pose of the rig relative to the arm, which the on-line stage does not. It follows from the joint angles
-//! and the observed gripper pose of the same moment, or is given.
+//! This needs the pose of the rig relative to the arm, which the on-line stage does not. It follows from the joint
+//! angles and the observed gripper pose of the same moment, or is given.
 
 use crate::offline::handle::setpoint::between;
 use graspd_rt::arm::{Dh, Joints, Model, inverse, newton};
@@ -30,8 +30,8 @@ impl Arm {
         Self { model, dh, joints, base_from_left, flange_from_gripper: *flange_from_gripper }
     }
 
-    /// An arm whose base pose in the left frame is known. The inverse kinematics starts from `joints`, which selects its
-    /// branch.
+    /// An arm whose base pose in the left frame is known. The inverse kinematics starts from `joints`, which selects
+    /// its branch.
     pub fn placed(model: Model, joints: Joints, left_from_base: &Pose, flange_from_gripper: &Pose) -> Self {
         Self {
             model,
@@ -50,8 +50,8 @@ impl Arm {
         self.model.joints().iter().zip(q.iter()).all(|(r, v)| *v >= r.min && *v <= r.max)
     }
 
-    /// Whether the gripper can move to `from` and on a straight line to `to` (poses in the left frame), within the joint
-    /// limits and without changing the branch.
+    /// Whether the gripper can move to `from` and on a straight line to `to` (poses in the left frame), within the
+    /// joint limits and without changing the branch.
     pub fn follows(&self, from: &Pose, to: &Pose) -> bool {
         let Ok(mut q) = inverse(&self.dh, &self.flange(from), &self.joints) else { return false };
         if !self.within_limits(&q) {

@@ -204,15 +204,16 @@ fn components_and_cavities_are_oriented_separately() {
         let m = parse(&binary(t), "stl", 1e-3).unwrap().mesh;
         (0..m.triangles.len()).map(|t| m.corners(t)).map(|[a, b, c]| a.dot(&b.cross(&c)) / 6.0 * 1e6).sum::<f64>()
     };
-    // Two separate cubes of 64 and 8 cm3, one of them inside out: their volumes add. A cavity of 8 cm3 is subtracted, for
-    // either orientation of the whole mesh.
+    // Two separate cubes of 64 and 8 cm3, one of them inside out: their volumes add. A cavity of 8 cm3 is subtracted,
+    // for either orientation of the whole mesh.
     let (large, small) = (at(cube(), 1.0, 0.0), at(cube(), 0.5, 60.0));
     for t in [[large.clone(), flip(small.clone())].concat(), [flip(large.clone()), small].concat()] {
         assert!((volume(&t) - 72.0).abs() < 1e-3, "{}", volume(&t));
     }
     let hollow = [large, flip(at(cube(), 0.5, 0.0))].concat();
     assert!((volume(&hollow) - 56.0).abs() < 1e-3 && (volume(&flip(hollow)) - 56.0).abs() < 1e-3);
-    // Six faces that share no corner (each a few micrometres from the next), every second one wound inwards: still a cube.
+    // Six faces that share no corner (each a few micrometres from the next), every second one wound inwards: still a
+    // cube.
     let mut loose = cube();
     for (k, t) in loose.iter_mut().enumerate() {
         *t = t.map(|v| v.map(|x| x * (1.0 + 1e-4 * (k / 2) as f32)));

@@ -20,8 +20,8 @@ const MAX_RELAX_ROUNDS: f64 = 10.0;
 /// Fewest vertices from which the noise is estimated.
 const MIN_SCAN_VERTICES: usize = 2000;
 
-/// Whether a mesh is a noisy scan: many triangles differ from all their neighbours. In a CAD model nearly every triangle has
-/// a neighbour in its own plane.
+/// Whether a mesh is a noisy scan: many triangles differ from all their neighbours. In a CAD model nearly every
+/// triangle has a neighbour in its own plane.
 pub(super) fn is_noisy(links: &Links, vector: &[Vec3], needle: &[bool]) -> bool {
     let unit = |t: u32| vector.get(t as usize).and_then(|v| v.try_normalize(1e-300));
     let is_needle = |t: u32| needle.get(t as usize).copied().unwrap_or(false);
@@ -34,8 +34,8 @@ pub(super) fn is_noisy(links: &Links, vector: &[Vec3], needle: &[bool]) -> bool 
     quantile(&mut angles, NOISY_QUANTILE) > NOISY_ANGLE
 }
 
-/// A noisy mesh with its vertices moved towards the mean of their neighbours a few times. This removes the noise, and also
-/// any detail of the size of a few triangles; the result is only used to find flat regions. `noise` is in metres.
+/// A noisy mesh with its vertices moved towards the mean of their neighbours a few times. This removes the noise, and
+/// also any detail of the size of a few triangles; the result is only used to find flat regions. `noise` is in metres.
 pub(super) fn relaxed(mesh: &Mesh, noise: f64) -> Mesh {
     let mut out = mesh.clone();
     let mut edges: Vec<f64> =
@@ -51,8 +51,8 @@ pub(super) fn relaxed(mesh: &Mesh, noise: f64) -> Mesh {
     out
 }
 
-/// Unit normals from area vectors, averaged over neighbours but not across creases: the triangles of a scan may be smaller
-/// than its noise.
+/// Unit normals from area vectors, averaged over neighbours but not across creases: the triangles of a scan may be
+/// smaller than its noise.
 pub(super) fn smoothed(links: &Links, vector: &[Vec3], needle: &[bool], noisy: bool) -> Vec<Vec3> {
     let unit = |v: &Vec3| v.try_normalize(1e-300).unwrap_or_default();
     let mut normal: Vec<Vec3> = vector.iter().map(unit).collect();

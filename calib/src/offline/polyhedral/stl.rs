@@ -163,8 +163,8 @@ impl<'a> Parser<'a> {
         self.words.get(k).is_some_and(|w| w.1.eq_ignore_ascii_case(word))
     }
 
-    /// Index of the word after the name of a solid. A name ends with its line or, where everything is on one line, before
-    /// "facet normal" or "endsolid".
+    /// Index of the word after the name of a solid. A name ends with its line or, where everything is on one line,
+    /// before "facet normal" or "endsolid".
     fn name_end(&self, line: usize) -> usize {
         let from = self.next;
         let ends = |k: usize| {

@@ -115,8 +115,8 @@ pub fn orient(mesh: &mut Mesh) -> Topology {
     found
 }
 
-/// Collects the component of a triangle and marks in `turn` the minority of its triangles that has to be reversed so that
-/// all agree.
+/// Collects the component of a triangle and marks in `turn` the minority of its triangles that has to be reversed so
+/// that all agree.
 fn orient_component(
     first: u32,
     near: &[Vec<(u32, bool)>],
@@ -132,7 +132,8 @@ fn orient_component(
         next += 1;
         let own = turn.get(t as usize).copied().flatten().unwrap_or(false);
         for (u, agree) in near.get(t as usize).into_iter().flatten() {
-            // A neighbour that agrees is reversed with this triangle; one that disagrees is reversed if this one is not.
+            // A neighbour that agrees is reversed with this triangle; one that disagrees is reversed if this one is
+            // not.
             let required = own == *agree;
             match turn.get_mut(*u as usize) {
                 Some(slot @ None) => {
@@ -160,9 +161,9 @@ const MAX_COMPONENTS: usize = 3000;
 
 /// The components of a mesh whose normals point inwards.
 ///
-/// For a closed component the sign of its volume decides, unless it is a cavity inside another one: a cavity is reversed
-/// only with the whole mesh. A component with open edges is a part of a surface that others complete: the parity of ray
-/// crossings on both sides of it decides.
+/// For a closed component the sign of its volume decides, unless it is a cavity inside another one: a cavity is
+/// reversed only with the whole mesh. A component with open edges is a part of a surface that others complete: the
+/// parity of ray crossings on both sides of it decides.
 fn inwards(mesh: &Mesh, components: &[Vec<u32>], closed: &[bool]) -> Vec<usize> {
     let all = |mesh: &Mesh| {
         if volume(mesh, 0..mesh.triangles.len() as u32) < 0.0 { (0..components.len()).collect() } else { Vec::new() }
