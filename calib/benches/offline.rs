@@ -1,5 +1,5 @@
-//! Run times of the off-line mathematics: `cargo bench -p graspd-calib --bench offline`. Prints figures; does not
-//! compare them with limits.
+//! Run times of the off-line stage's mathematics: `cargo bench -p graspd-calib --bench offline`. There is no pass or
+//! fail.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::offline::conic::{fit_direct, fit_ml};
@@ -16,6 +16,7 @@ use nalgebra::Vector3;
 use std::hint::black_box;
 use std::time::Instant;
 
+/// Prints the median and the 99th percentile of a work's run time.
 fn time(name: &str, rounds: u32, mut work: impl FnMut()) {
     for _ in 0..rounds / 10 {
         work();
@@ -60,10 +61,10 @@ fn main() {
     time("fits, both closed forms, ML circle + ellipse, 2 x 200", 1000, || {
         black_box(analyse([&left, &right], [&p[0], &p[1]], black_box(&plain)).ok());
     });
-    time("full reconstruction, no outlier search, 2 x 200", 1000, || {
+    time("complete reconstruction, no outlier search, 2 x 200", 1000, || {
         black_box(reconstruct(&left, &p[0], &right, &p[1], black_box(&plain)).ok());
     });
-    time("full reconstruction with outlier search, 2 x 200", 1000, || {
+    time("complete reconstruction with outlier search, 2 x 200", 1000, || {
         black_box(reconstruct(&left, &p[0], &right, &p[1], black_box(&robust)).ok());
     });
 }

@@ -1,6 +1,8 @@
-//! The golden cases: every field of every case within the tolerances stated in the file.
+//! The golden cases of `graspd reconstruct`: every field within its tolerance, for any names and any order of the
+//! cases.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
+use graspd_calib::commands::reconstruct::reconstruct_file;
 use serde_json::Value;
 
 const CASES: &str = include_str!("data/conic_golden.json");
@@ -26,13 +28,13 @@ fn norm(a: &[f64]) -> f64 {
     a.iter().map(|x| x * x).sum::<f64>().sqrt()
 }
 
-/// Distance of two directions whose sign has no meaning.
+/// Distance of two directions up to sign.
 fn line(a: &[f64], b: &[f64]) -> f64 {
     let minus: Vec<f64> = b.iter().map(|x| -x).collect();
     distance(a, b).min(distance(a, &minus))
 }
 
-/// Worst deviation as a fraction of what is allowed, with where it happened.
+/// The largest deviation as a fraction of its tolerance, and the field where it occurs.
 #[derive(Default)]
 struct Worst(f64, String);
 
@@ -101,7 +103,7 @@ fn marks(w: &mut Worst, id: &str, got: &Value, want: &Value, px: f64, length: f6
 #[test]
 fn every_golden_case_is_within_its_tolerances() {
     let input: Value = serde_json::from_str(CASES).unwrap();
-    let output: Value = serde_json::from_str(&graspd_calib::golden::reconstruct_file(CASES).unwrap()).unwrap();
+    let output: Value = serde_json::from_str(&reconstruct_file(CASES).unwrap()).unwrap();
     let mut w = Worst::default();
     let cases = input["cases"].as_array().unwrap();
     let results = output["cases"].as_array().unwrap();
@@ -158,7 +160,7 @@ fn every_golden_case_is_within_its_tolerances() {
             let turn = (num(&g["phi"]) - num(&r["phi"])).abs();
             marks(&mut w, id, g, r, 0.05 + turn * 130.0, 0.1 + turn * 130.0);
         } else {
-            // A major axis has no sign: the four poses match in the given order or half a turn on.
+            // The four poses are compared in the given order.
             let (g, r) = (got["grasp_ellipse"].as_array().unwrap(), want["grasp_ellipse"].as_array().unwrap());
             for k in 0..4 {
                 assert_eq!(g[k]["index"], r[k]["index"]);
@@ -171,14 +173,13 @@ fn every_golden_case_is_within_its_tolerances() {
     println!("closest to its tolerance: {} at {:.3} of it", w.1, w.0);
 }
 
-/// Random rigs (verged, parallel, skew, rolled, portrait, any frame, unit and scale of P), rims and noise, with what
-/// the numpy reference answers; made independently, so that the golden file is not all that the chain was ever held
-/// against.
+/// Random rigs (verged, parallel, skew, rolled, portrait, any frame, unit and scale of P), rims and noise, with the
+/// results of the numpy reference: a second set of data besides the golden file.
 #[test]
 fn random_rigs_agree_with_the_reference() {
     const RANDOM: &str = include_str!("data/conic_random.json");
     let input: Value = serde_json::from_str(RANDOM).unwrap();
-    let output: Value = serde_json::from_str(&graspd_calib::golden::reconstruct_file(RANDOM).unwrap()).unwrap();
+    let output: Value = serde_json::from_str(&reconstruct_file(RANDOM).unwrap()).unwrap();
     let mut w = Worst::default();
     for (case, got) in input["cases"].as_array().unwrap().iter().zip(output["cases"].as_array().unwrap()) {
         let (id, want) = (case["id"].as_str().unwrap(), &case["expect"]);
@@ -204,7 +205,7 @@ fn random_rigs_agree_with_the_reference() {
 #[test]
 fn names_order_and_truth_do_not_matter() {
     let mut input: Value = serde_json::from_str(CASES).unwrap();
-    let plain: Value = serde_json::from_str(&graspd_calib::golden::reconstruct_file(CASES).unwrap()).unwrap();
+    let plain: Value = serde_json::from_str(&reconstruct_file(CASES).unwrap()).unwrap();
     let cases = input["cases"].as_array_mut().unwrap();
     cases.reverse();
     let allowed = ["image_size", "P_left", "P_right", "points_left", "points_right", "sigma_px"];
@@ -214,7 +215,7 @@ fn names_order_and_truth_do_not_matter() {
         object.insert("id".into(), i.into());
     }
     let text = serde_json::to_string(&input).unwrap();
-    let mut again: Value = serde_json::from_str(&graspd_calib::golden::reconstruct_file(&text).unwrap()).unwrap();
+    let mut again: Value = serde_json::from_str(&reconstruct_file(&text).unwrap()).unwrap();
     again["cases"].as_array_mut().unwrap().reverse();
     for (a, b) in plain["cases"].as_array().unwrap().iter().zip(again["cases"].as_array().unwrap()) {
         let (mut a, mut b) = (a.clone(), b.clone());
@@ -225,7 +226,7 @@ fn names_order_and_truth_do_not_matter() {
 }
 
 #[test]
-fn a_malformed_case_is_an_error_of_its_own() {
+fn a_malformed_case_is_an_error_of_that_case_only() {
     let input: Value = serde_json::from_str(CASES).unwrap();
     let good = input["cases"][1].clone();
     let mut bad = Vec::new();
@@ -247,7 +248,7 @@ fn a_malformed_case_is_an_error_of_its_own() {
     text += "null,7,{},\"a \\\"NaN\\\" in a string\",";
     text += &serde_json::to_string(&good).unwrap();
     text += "]}";
-    let output: Value = serde_json::from_str(&graspd_calib::golden::reconstruct_file(&text).unwrap()).unwrap();
+    let output: Value = serde_json::from_str(&reconstruct_file(&text).unwrap()).unwrap();
     let results = output["cases"].as_array().unwrap();
     assert_eq!(results.len(), bad.len() + 5);
     for (i, r) in results[..bad.len() + 4].iter().enumerate() {
@@ -256,6 +257,6 @@ fn a_malformed_case_is_an_error_of_its_own() {
     }
     assert_eq!(results.last().unwrap()["status"], "ok");
     for text in ["", "{", "[]", "{\"cases\":3}", "\u{feff}{}", "{\"cases\":[\"\\"] {
-        assert!(graspd_calib::golden::reconstruct_file(text).is_err(), "{text}");
+        assert!(reconstruct_file(text).is_err(), "{text}");
     }
 }

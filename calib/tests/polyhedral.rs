@@ -1,9 +1,9 @@
-//! A part with a mesh, from files to a plan: its pose from picked pixels as sure as it says, every handle, the same bytes twice.
+//! A part with a mesh, from files to a plan: a consistent pose from picked pixels, all handles, reproducible bytes.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
+use graspd_calib::commands::mesh::{MeshRequest, run};
+use graspd_calib::commands::{Class, Outcome};
 use graspd_calib::files::{GripperFile, PlanFile, RigFile};
-use graspd_calib::mesh_cli::{MeshRequest, run};
-use graspd_calib::plan_cli::{Class, Outcome};
 use graspd_rt::geom::{Pose, Vec3, View};
 use nalgebra::{Matrix3, Point3, UnitQuaternion};
 use rand::{RngExt, SeedableRng};
@@ -33,7 +33,7 @@ translation_m = [-0.48, 0.0, 0.08]
 rotation_vector_rad = [0.0, 0.32, 0.0]
 "#;
 
-/// A folder of its own for each test, removed at its end.
+/// A temporary folder for each test, removed at its end.
 struct Folder(PathBuf);
 
 impl Folder {
@@ -162,7 +162,7 @@ fn done(o: &Outcome) -> &Outcome {
 }
 
 #[test]
-fn picked_pixels_give_the_pose_to_the_bound_they_state() {
+fn picked_pixels_give_a_pose_with_a_consistent_covariance() {
     let f = Folder::new("picks");
     let mesh = f.write("part.stl", stl(&stepped()));
     let out = f.0.join("plan.toml");
@@ -179,7 +179,7 @@ fn picked_pixels_give_the_pose_to_the_bound_they_state() {
         done(&run(&request));
         let text = std::fs::read_to_string(&out).unwrap();
         let plan = PlanFile::parse(&text, "plan").unwrap();
-        // The same handle of the true part: where its grasp would have been.
+        // The grasp error: the motion between the true part and the estimated one.
         let record = plan.mesh.as_ref().unwrap().left_from_mesh.clone();
         let pose = |p: &graspd_calib::files::PoseRecord| {
             let [w, i, j, k] = p.quaternion_wxyz.unwrap();
@@ -202,9 +202,9 @@ fn picked_pixels_give_the_pose_to_the_bound_they_state() {
         turns += d.dot(&(cov.try_inverse().unwrap() * d));
         assert!(plan.object.sigma_centre_mm < 3.0);
     }
-    // 3 and 2 are honest; 60 trials scatter by 0.3 and 0.26, and the noise is never taken for less than a pixel.
+    // A consistent covariance gives 3 and 2; over 60 trials the means have standard deviations of 0.3 and 0.26.
     let (d3, d2) = (squared / n as f64, turns / n as f64);
-    println!("mean squared Mahalanobis distance: place {d3:.2} of 3, axis {d2:.2} of 2");
+    println!("mean squared Mahalanobis distance: position {d3:.2} of 3, axis {d2:.2} of 2");
     assert!((2.0..4.2).contains(&d3) && (1.2..3.0).contains(&d2), "{d3} {d2}");
 }
 
@@ -230,7 +230,7 @@ fn one_wrong_pick_is_named_and_too_few_are_refused() {
 }
 
 #[test]
-fn the_report_is_one_page_that_tells_all() {
+fn the_report_is_one_complete_page() {
     let f = Folder::new("report");
     let mesh = f.write("part.stl", stl(&stepped()));
     let page = |name: &str, r: MeshRequest| {
@@ -241,8 +241,8 @@ fn the_report_is_one_page_that_tells_all() {
     };
     let picked = MeshRequest { picks: picks(0.5, 2), ..f.request(&mesh) };
     let (html, o) = page("a.html", picked.clone());
-    assert!(html == page("b.html", picked).0, "the same input gave another page");
-    // Nothing is fetched, the image is in it, both views' residuals and both ellipses are drawn.
+    assert!(html == page("b.html", picked).0, "the same input gave a different page");
+    // No external resources; the image, the residuals of both views and both uncertainty ellipses are in the page.
     assert!(!html.contains("http") && !html.contains("<script") && html.contains("data:image/png;base64,"));
     assert_eq!(html.matches("<svg").count(), 4);
     assert!(html.contains(o.json["set_point"].as_str().unwrap()));
@@ -260,7 +260,7 @@ fn the_report_is_one_page_that_tells_all() {
         let verdict = if r["number"] == 1 { String::from("chosen") } else { verdict };
         from += table[from..].find(&verdict).unwrap_or_else(|| panic!("{verdict}"));
     }
-    // A pose from a file has no picks to show; without its sigma no ellipse either.
+    // A pose from a file has no picks.
     let (html, _) = page("c.html", posed(&f, &mesh));
     assert!(!html.contains("<h2>Picked") && html.matches("<svg").count() == 2);
 }
@@ -276,7 +276,7 @@ fn posed(f: &Folder, mesh: &Path) -> MeshRequest {
 }
 
 #[test]
-fn the_plan_is_complete_the_loop_takes_it_and_twice_gives_the_same_bytes() {
+fn the_plan_is_complete_valid_for_the_loop_and_reproducible() {
     let f = Folder::new("bytes");
     let mesh = f.write("part.stl", stl(&stepped()));
     let mut texts = Vec::new();
@@ -304,13 +304,13 @@ fn the_plan_is_complete_the_loop_takes_it_and_twice_gives_the_same_bytes() {
         assert!(set.grasp.marks.iter().any(|m| m.iter().flatten().count() >= 4));
         let path = plan.path.unwrap();
         assert!(path.turn_deg > 0.0 && path.length_m > 0.08);
-        // Of the four coplanar ways some are dropped, each with its reason.
+        // Some candidates are dropped, each with its reason.
         assert!(plan.candidate.iter().any(|c| c.verdict.starts_with("dropped: ")));
         assert_eq!(plan.candidate[0].verdict, "chosen");
     }
-    assert!(texts[0] == texts[1], "the same input gave other bytes");
+    assert!(texts[0] == texts[1], "the same input gave different bytes");
     assert!(texts[0].1.len() > 10_000);
-    // Another handle by its number is another plan; one that is dropped is refused with its reason.
+    // Another handle gives another plan; a dropped one is refused with its reason.
     let list = run(&MeshRequest { list: true, ..posed(&f, &mesh) });
     let rows = done(&list).json["handles"].as_array().unwrap().clone();
     assert!(list.text.contains("dropped: "));
@@ -328,17 +328,17 @@ fn the_plan_is_complete_the_loop_takes_it_and_twice_gives_the_same_bytes() {
 }
 
 #[test]
-fn every_filter_names_itself() {
+fn every_filter_reports_its_kind() {
     let f = Folder::new("filters");
     let mesh = f.write("part.stl", stl(&block([-20.0; 3], [20.0; 3])));
     let kinds = |r: &MeshRequest| -> Vec<String> {
         let o = run(&MeshRequest { list: true, ..r.clone() });
         let rows = done(&o).json["handles"].as_array().unwrap().clone();
-        assert_eq!(rows.len(), 12, "three pairs of faces, four ways in");
+        assert_eq!(rows.len(), 12, "three pairs of faces, four approaches");
         rows.iter().filter_map(|r| r["kind"].as_str().map(str::to_owned)).collect()
     };
     let plain = posed(&f, &mesh);
-    // From behind the part the marks are hidden, from before it they are seen.
+    // The marks are visible in front of the part, and occluded behind it.
     let hidden = kinds(&plain);
     assert!(
         !hidden.is_empty() && hidden.len() < 12 && hidden.iter().all(|k| k == "with too few marks seen"),
@@ -356,16 +356,16 @@ fn every_filter_names_itself() {
     let far = MeshRequest { arm: Some("ur5e".to_owned()), base: Some("0,0,5,0,0,0".to_owned()), ..plain.clone() };
     assert!(kinds(&far).iter().all(|k| k == "out of reach"));
     let near = MeshRequest { base: Some("0.1,0.5,1.6,1.57,0,0".to_owned()), ..far.clone() };
-    assert!(kinds(&near).len() < 12, "a base next to the part reaches some of it");
+    assert!(kinds(&near).len() < 12, "an arm next to the part reaches some of the handles");
     let turn = MeshRequest { present: Some("0,0,1,0,0,0".to_owned()), max_turn_deg: Some(1.0), ..plain.clone() };
     assert!(kinds(&turn).iter().any(|k| k == "with too large a turn"));
     let contact = MeshRequest { contact_mm2: Some(5000.0), ..plain.clone() };
     assert_eq!(run(&contact).class, Class::Refused);
-    let sure = run(&MeshRequest { tolerance_mm: Some(0.1), ..plain });
-    assert!(sure.class == Class::Refused && sure.json["kind"] == "too-uncertain", "{}", sure.text);
+    let uncertain = run(&MeshRequest { tolerance_mm: Some(0.1), ..plain });
+    assert!(uncertain.class == Class::Refused && uncertain.json["kind"] == "too-uncertain", "{}", uncertain.text);
 }
 
-/// A cube and a stepped block, scanned: more than 100,000 triangles, each corner off by a few hundredths of a millimetre.
+/// A scan of boxes: more than 100,000 triangles, with noise of a few hundredths of a millimetre on each corner.
 fn scan(boxes: &[([f64; 3], [f64; 3])], n: usize, noise: f64) -> Corners {
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(17);
     let mut moved = std::collections::HashMap::new();
@@ -397,7 +397,7 @@ fn scan(boxes: &[([f64; 3], [f64; 3])], n: usize, noise: f64) -> Corners {
 }
 
 #[test]
-fn a_scan_gives_the_handles_of_the_part_it_is_a_scan_of() {
+fn a_scan_has_the_handles_of_its_part() {
     let f = Folder::new("scan");
     for (name, boxes, exact) in [
         ("cube", vec![([-20.0; 3], [20.0; 3])], block([-20.0; 3], [20.0; 3])),
@@ -416,7 +416,7 @@ fn a_scan_gives_the_handles_of_the_part_it_is_a_scan_of() {
         let s = run(&MeshRequest { list: true, ..posed(&f, &scanned) });
         println!("{name}: {} triangles in {:.2} s", corners.len(), from.elapsed().as_secs_f64());
         let c = run(&MeshRequest { list: true, ..posed(&f, &cad) });
-        // Every handle of the CAD part that can be taken is found in its scan: closing line, way in, width.
+        // Every possible handle of the CAD model is found in its scan, with the same closing line, approach and width.
         let rows = |o: &Outcome| done(o).json["handles"].as_array().unwrap().clone();
         let v = |r: &serde_json::Value, k: &str| Vec3::from_fn(|i, _| r[k][i].as_f64().unwrap());
         for want in rows(&c).iter().filter(|r| r["possible"] == true) {
@@ -428,7 +428,7 @@ fn a_scan_gives_the_handles_of_the_part_it_is_a_scan_of() {
             });
             assert!(found, "{name}: {want}");
         }
-        // And none that the CAD part does not have.
+        // The scan has no other handle.
         for got in rows(&s).iter().filter(|r| r["possible"] == true) {
             let known = rows(&c).iter().any(|r| {
                 r["possible"] == true

@@ -1,4 +1,5 @@
-//! Handles of parts held against a search of its own: random bodies of boxes, profiles, scans; nothing that can be taken is missed, nothing kept collides.
+//! Handles compared with an independent exhaustive search: random bodies of boxes, profiles, scans. No possible grasp
+//! is missing, and no listed grasp collides.
 #![allow(clippy::unwrap_used)] // a test, bench or example
 
 mod common_mesh;
@@ -14,18 +15,19 @@ fn kept(rows: &[Row]) -> BTreeSet<Key> {
     rows.iter().filter(|r| r.free).map(key).collect()
 }
 
-/// Bodies of three to five boxes with one cut out: every grasp along the axes that the search finds is in the list, none that it denies is.
+/// Bodies of three to five boxes with one box removed: the list has all axis-parallel grasps that the search finds, and
+/// no other.
 #[test]
 fn random_bodies_of_boxes_have_the_grasps_that_a_search_finds() {
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(2026);
     let mut found = 0;
     for k in 0..36 {
-        // Every third with a gripper whose body stands out to one side: half a turn matters to it.
+        // Every third gripper has a body that protrudes to one side, so that half a turn matters.
         let jaw = if k % 3 == 2 { Jaw { body: [[-40.0, -50.0, -75.0], [40.0, 6.0, -40.0]], ..JAW } } else { JAW };
         let f = Folder::new(&format!("random{k}"), &jaw);
-        let mut block = |most: i32| -> Block {
+        let mut block = |max: i32| -> Block {
             let lo = [0; 3].map(|_| f64::from(rng.random_range(-8..6)) * 5.0);
-            [lo, lo.map(|l| l + f64::from(rng.random_range(1..most)) * 5.0)]
+            [lo, lo.map(|l| l + f64::from(rng.random_range(1..max)) * 5.0)]
         };
         let add: Vec<Block> = (0..3 + k % 3).map(|_| block(9)).collect();
         let solid = Solid::new(add, vec![block(5)]);
@@ -44,24 +46,28 @@ fn random_bodies_of_boxes_have_the_grasps_that_a_search_finds() {
     assert!(found > 1000, "{found}");
 }
 
-/// Profiles with the number of grasps that a hand counts: those whose faces the claws (12 mm wide, 8 mm thick, 40 mm long, open to 60 mm) reach.
+/// Profiles with the number of their grasps, counted by hand: those whose faces the claws (12 mm wide, 8 mm thick, 40
+/// mm long, opening to 60 mm) reach.
 fn profiles() -> Vec<(&'static str, usize, Solid)> {
     let s = Solid::new;
     vec![
-        // Three pairs of faces, four ways each.
+        // Three pairs of faces, four approaches each.
         ("cube", 12, s(vec![[[-20.0; 3], [20.0; 3]]], vec![])),
-        // Legs of 50 mm, 8 mm thick, 30 mm deep. Each leg across its thickness from its free end and from both open sides: 3 ways, 2 legs: 6. The
-        // outer size along each leg, 50 mm, at the foot of the other leg: from outside and from both sides: 6. The depth of 30 mm: from the four
-        // directions along the legs: 4.
+        // Legs of 50 mm, 8 mm thick, 30 mm deep. Each leg across its thickness, from its free end and from both open
+        // sides: 3 approaches for 2 legs, 6. The outer size along each leg, 50 mm, at the foot of the other leg, from
+        // outside and from both sides: 6. The depth of 30 mm, from the four directions along the legs: 4.
         ("L", 16, s(vec![[[0.0, 0.0, 0.0], [50.0, 8.0, 30.0]], [[0.0, 0.0, 0.0], [8.0, 50.0, 30.0]]], vec![])),
-        // The bottom of the pocket is 4 mm thick and out of reach from above; four walls: from above, and the outer sizes: 12 mm high, 50 wide.
+        // The bottom of the pocket is 4 mm thick and out of reach from above. Four walls from above, and the outer
+        // sizes: 12 mm high, 50 mm wide.
         ("pocket", 12, s(vec![[[0.0, 0.0, 0.0], [80.0, 50.0, 12.0]]], vec![[[20.0, 12.0, 4.0], [60.0, 38.0, 12.0]]])),
-        // A frame, 90 x 60 x 5 mm with a hole of 40 x 20: its thickness from four sides, each of four bars across from above and below.
+        // A frame of 90 x 60 x 5 mm with a hole of 40 x 20 mm: its thickness from four sides, and each of four bars
+        // across, from above and below.
         ("frame", 12, s(vec![[[0.0, 0.0, 0.0], [90.0, 60.0, 5.0]]], vec![[[25.0, 20.0, 0.0], [65.0, 40.0, 5.0]]])),
     ]
 }
 
-/// A scan, moved by a pose, has the grasps of the part and no others: closing line to 2.5 degrees, way in to 6, width and place to 0.2 mm.
+/// A scan, moved by a pose, has the grasps of the part and no others: closing direction within 2.5 degrees, approach
+/// within 6 degrees, width and position within 0.2 mm.
 fn same_grasps(name: &str, scan: &[Row], cad: &[Row], pose: &Pose) {
     let back = pose.inverse();
     let same = |scan: &Row, cad: &Row| {
@@ -81,7 +87,7 @@ fn same_grasps(name: &str, scan: &[Row], cad: &[Row], pose: &Pose) {
 }
 
 #[test]
-fn profiles_have_the_grasps_of_a_hand_count_and_a_scan_of_them_has_the_same() {
+fn profiles_and_their_scans_have_the_grasps_counted_by_hand() {
     let f = Folder::new("profiles", &JAW);
     let pose = Pose::new(Vec3::new(0.1, -0.05, 0.2), Vec3::new(0.7, -1.1, 0.4));
     for (n, (name, count, solid)) in profiles().into_iter().enumerate() {
@@ -95,7 +101,7 @@ fn profiles_have_the_grasps_of_a_hand_count_and_a_scan_of_them_has_the_same() {
             .map(|[a, b, c]| 0.5 * (b - a).cross(&(c - a)).norm())
             .sum();
         let step = (2.0 * area / 112_000.0).sqrt();
-        // Noise up to a third of a triangle's side, which turns its normal by 30 degrees and more.
+        // Noise up to a third of a triangle's side, which rotates its normal by 30 degrees and more.
         for noise in [0.02, 0.05, 0.1] {
             let corners = moved(&solid.scan(step, noise, n as u64), &pose);
             assert!(corners.len() > 100_000, "{}", corners.len());
@@ -112,7 +118,7 @@ fn profiles_have_the_grasps_of_a_hand_count_and_a_scan_of_them_has_the_same() {
 }
 
 #[test]
-fn broken_meshes_of_a_part_have_its_grasps() {
+fn damaged_meshes_of_a_part_have_its_grasps() {
     let f = Folder::new("broken", &JAW);
     let (_, _, solid) = profiles().remove(2);
     let clean = solid.corners();
@@ -132,7 +138,7 @@ fn broken_meshes_of_a_part_have_its_grasps() {
     check("corners that nearly coincide", &off);
     let off = clean.iter().map(|t| t.map(|p| p.map(|x| x + rng.random_range(-2e-4..2e-4)))).collect();
     check("corners that do not", &off);
-    // Each quad cut by itself into thousands of slivers that share no vertex with those beside it.
+    // Each quad cut separately into hundreds of slivers that share no vertex with those of its neighbours.
     let lerp = |a: [f64; 3], b: [f64; 3], s: f64| [0, 1, 2].map(|k| a[k] + (b[k] - a[k]) * s);
     let mut slivers = Corners::new();
     for (k, q) in solid.quads().iter().enumerate() {
@@ -146,13 +152,13 @@ fn broken_meshes_of_a_part_have_its_grasps() {
         }
     }
     check("slivers", &slivers);
-    // The part as a heap of boxes that touch, each with its own skin.
+    // The part as a set of touching boxes, each with its complete surface.
     let heap: Corners = solid.cells().iter().flat_map(|b| Solid::new(vec![*b], vec![]).corners()).collect();
     check("boxes side by side", &heap);
 }
 
 #[test]
-fn every_way_of_writing_a_part_is_read_alike() {
+fn all_ways_of_writing_a_part_give_the_same_handles() {
     let f = Folder::new("written", &JAW);
     let (_, _, solid) = profiles().remove(1);
     let want = f.list(&f.write("part.stl", stl(&solid.corners())));
@@ -160,7 +166,7 @@ fn every_way_of_writing_a_part_is_read_alike() {
         let got = f.list(&f.write(name, content));
         assert_eq!(kept(&got), kept(&want), "{name}");
     };
-    // A text without line breaks, one with old ones, one with tabs, capitals and no names.
+    // A text without line breaks, one with CR line ends, one with tabs, capitals and no names.
     let mut words = String::from("solid a part of facets");
     for t in solid.corners() {
         words += " facet normal nan 0 -nan(ind) outer loop";
@@ -180,8 +186,8 @@ fn every_way_of_writing_a_part_is_read_alike() {
     same("tabs.stl", upper.as_bytes());
     let mut binary = stl(&solid.corners());
     binary[..30].copy_from_slice(b"solid facet normal vertex loop");
-    same("liar.stl", &binary);
-    // Quads counted backwards, with texture and normals; then faces before the vertices.
+    same("misleading.stl", &binary);
+    // Quads with negative indices, texture and normals; then faces before the vertices.
     let (mut backwards, mut faces, mut vertices) = (String::from("vt 0 0\nvn 0 0 1\n"), String::new(), String::new());
     for (k, q) in solid.quads().iter().enumerate() {
         let mut corners = String::new();
@@ -194,32 +200,32 @@ fn every_way_of_writing_a_part_is_read_alike() {
     }
     same("backwards.obj", backwards.as_bytes());
     same("first.obj", format!("{faces}{vertices}").as_bytes());
-    // One polygon of six corners on either end.
+    // One polygon of six corners at each end.
     let l = [[0.0, 0.0], [50.0, 0.0], [50.0, 8.0], [8.0, 8.0], [8.0, 50.0], [0.0, 50.0]];
     same("polygons.obj", prism(&l, 30.0).as_bytes());
-    // And in inches.
+    // In inches.
     let inches: Corners = solid.corners().iter().map(|t| t.map(|p| p.map(|x| x / 25.4))).collect();
-    let o = graspd_calib::mesh_cli::run(&graspd_calib::mesh_cli::MeshRequest {
+    let o = graspd_calib::commands::mesh::run(&graspd_calib::commands::mesh::MeshRequest {
         unit: "inch".to_owned(),
         ..f.request(&f.write("inch.stl", stl(&inches)))
     });
     assert_eq!(kept(&rows(&o.json)), kept(&want));
 }
 
-/// No point of a dense sample of the surface lies in the gripper at the grasp or on the way to it.
+/// No point of a dense sample of the surface is inside the gripper at the grasp or during the approach.
 fn nothing_collides(rows: &[Row], surface: &[Vec3], jaw: &Jaw) {
     for r in rows.iter().filter(|r| r.free) {
         for b in jaw.boxes(r.opening) {
             for p in surface {
                 let q = (r.mesh_from_gripper.inverse() * Point3::from(p * 1e-3)).coords * 1e3;
-                let hit = (0..2).all(|k| q[k] > b[0][k] && q[k] < b[1][k]) && q.z > b[0][2] - WAY && q.z < b[1][2];
+                let hit = (0..2).all(|k| q[k] > b[0][k] && q[k] < b[1][k]) && q.z > b[0][2] - APPROACH && q.z < b[1][2];
                 assert!(!hit, "{p:?} of the part is in the gripper: {r:?}");
             }
         }
     }
 }
 
-/// Points on a round wall, a quarter of a millimetre high and a degree round.
+/// Points on a cylindrical wall, a quarter of a millimetre apart in height and one degree around.
 fn wall(radius: f64, height: f64) -> Vec<Vec3> {
     (0..360)
         .flat_map(|a| {
@@ -232,17 +238,17 @@ fn wall(radius: f64, height: f64) -> Vec<Vec3> {
 #[test]
 fn prisms_and_round_parts() {
     let f = Folder::new("round", &JAW);
-    // Eight sides, 40 mm across, 30 mm high: four pairs of flats with four ways each, and the ends with eight.
+    // Eight sides, 40 mm across, 30 mm high: four pairs of flats with four approaches each, and the ends with eight.
     let octagon = f.list(&f.write("octagon.obj", prism(&polygon(8, 20.0 / 22.5f64.to_radians().cos()), 30.0)));
     let of = |w: f64| octagon.iter().filter(|r| r.free && (r.width - w).abs() < 0.01).count();
     assert_eq!((of(40.0), of(30.0), octagon.len()), (16, 8, 24));
-    // A cylinder of 64 facets: from either end at every angle, its ends from all round.
+    // A cylinder of 64 facets: from each end at every angle, and its ends from all sides.
     let cylinder = f.list(&f.write("cylinder.obj", prism(&polygon(64, 15.0), 50.0)));
     nothing_collides(&cylinder, &wall(15.0, 50.0), &JAW);
-    let at = |rows: &[Row], angle: i32, width: f64, way: f64| {
+    let at = |rows: &[Row], angle: i32, width: f64, sign: f64| {
         let (s, c) = f64::from(angle).to_radians().sin_cos();
         let near = |d: &Vec3| (d.x * c + d.y * s).abs() > 15f64.to_radians().cos();
-        rows.iter().any(|r| r.free && near(&r.closing) && (r.width - width).abs() < 0.6 && r.approach.z * way > 0.99)
+        rows.iter().any(|r| r.free && near(&r.closing) && (r.width - width).abs() < 0.6 && r.approach.z * sign > 0.99)
     };
     for angle in (0..180).step_by(5) {
         assert!(at(&cylinder, angle, 30.0, 1.0) && at(&cylinder, angle, 30.0, -1.0), "{angle}");
@@ -253,8 +259,9 @@ fn prisms_and_round_parts() {
             r.free && r.closing.z.abs() > 0.999 && r.approach.x * c + r.approach.y * s > 25f64.to_radians().cos()
         })
     };
-    assert!((0..360).step_by(10).all(round), "a way in to the ends is missing");
-    // A tube of 72 and 60 mm: too wide across, but its wall of 6 mm can be taken all round, one claw in the bore.
+    assert!((0..360).step_by(10).all(round), "an approach to the ends is missing");
+    // A tube of 72 and 60 mm: too wide across, but its wall of 6 mm can be taken at every angle, with one claw in the
+    // bore.
     let (n, mut tube) = (72, String::new());
     for z in [0.0, 40.0] {
         for r in [36.0, 30.0] {
@@ -284,19 +291,20 @@ fn prisms_and_round_parts() {
 }
 
 #[test]
-fn a_wedge_is_taken_where_it_is_thin_and_a_thin_plate_at_all_its_sides() {
-    // 24.8 to 30 mm wide over 60 mm: on average too wide for jaws of 30 mm with air, at its thin end not.
+fn a_wedge_is_taken_at_its_thin_end_and_a_thin_plate_at_all_its_sides() {
+    // 24.8 to 30 mm wide over 60 mm: with clearance on average too wide for jaws of 30 mm, but not at its thin end.
     let jaw = Jaw { max: 30.0, ..JAW };
     let f = Folder::new("wedge", &jaw);
     let wedge = f.list(&f.write("wedge.obj", prism(&[[-15.0, 0.0], [15.0, 0.0], [12.4, 60.0], [-12.4, 60.0]], 50.0)));
-    let way = |d: Vec3| wedge.iter().find(|r| r.closing.x.abs() > 0.99 && r.approach.dot(&d) > 0.99).unwrap();
-    let thin = way(-Vec3::y());
+    let from = |d: Vec3| wedge.iter().find(|r| r.closing.x.abs() > 0.99 && r.approach.dot(&d) > 0.99).unwrap();
+    let thin = from(-Vec3::y());
     assert!(thin.free && thin.opening <= 30.0 && thin.opening > 24.8 + 2.0 * CLEARANCE, "{thin:?}");
-    assert_eq!(way(Vec3::y()).kind, "too wide");
+    assert_eq!(from(Vec3::y()).kind, "too wide");
     // From the open sides it can be taken near its thin end too.
-    assert!(way(Vec3::z()).free && way(-Vec3::z()).free);
-    // A plate of 50 x 27 x 2 mm: three pairs, four ways each. Its thickness from all four sides; its 27 mm from both ends, where the claws lie along
-    // the 2 mm sides, but not from above and below, where 12 mm of claw press 24 mm2 (40 are asked for). 27 mm and air is all that the jaws open.
+    assert!(from(Vec3::z()).free && from(-Vec3::z()).free);
+    // A plate of 50 x 27 x 2 mm: three pairs, four approaches each. Its thickness from all four sides; its 27 mm from
+    // both ends, where the claws are along the 2 mm sides, but not from above and below, where 12 mm of claw give a
+    // contact of 24 mm2 (40 are required). 27 mm with clearance is the largest opening of the jaws.
     let plate = f.list(&f.write("plate.stl", stl(&Solid::new(vec![[[0.0; 3], [50.0, 27.0, 2.0]]], vec![]).corners())));
     let free = plate.iter().filter(|r| r.free).count();
     let too_wide = plate.iter().filter(|r| r.kind == "too wide").count();
@@ -304,7 +312,7 @@ fn a_wedge_is_taken_where_it_is_thin_and_a_thin_plate_at_all_its_sides() {
     assert_eq!((plate.len(), free, too_wide, contact), (12, 6, 4, 2));
 }
 
-/// Time that this thread has spent on a processor: user and system time, counted in hundredths of a second (proc(5)).
+/// CPU time of this thread, user and system, in units of 1/100 s (proc(5)).
 fn busy_seconds() -> f64 {
     let text = std::fs::read_to_string("/proc/thread-self/stat").unwrap();
     let after_name = text.rsplit(')').next().unwrap();
@@ -312,10 +320,10 @@ fn busy_seconds() -> f64 {
 }
 
 #[test]
-fn large_scans_of_anything_take_less_than_two_seconds() {
+fn large_scans_of_any_shape_take_bounded_cpu_time() {
     let f = Folder::new("large", &JAW);
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(4);
-    // A ball, a tall vase of changing radius, and a ring: hundreds of small nearly flat patches.
+    // A ball and a tall vase of varying radius: hundreds of small, nearly flat patches.
     for (name, radius, n, m) in [("ball", 12.0, 390, 390), ("ball", 40.0, 390, 390), ("vase", 25.0, 400, 380)] {
         let mut at = std::collections::HashMap::new();
         let mut point = |i: usize, j: usize| {
@@ -340,7 +348,7 @@ fn large_scans_of_anything_take_less_than_two_seconds() {
         let rows = f.list(&path);
         let took = busy_seconds() - from;
         println!("{name} of {radius} mm: {} triangles, {} handles, {took:.2} s", t.len(), rows.len());
-        // Twice what is asked for, of this thread's own work: what runs beside it does not count.
+        // Twice the requirement of two seconds, in CPU time of this thread, so that other processes do not count.
         assert!(took < 4.0, "{name}: {took:.2} s");
     }
 }

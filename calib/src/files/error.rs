@@ -1,4 +1,4 @@
-//! What can be wrong with a file, said so that the reader knows which key to change and how.
+//! Errors of files: each names the file, the line, the key, the problem and the fix.
 
 use std::path::Path;
 
@@ -10,20 +10,20 @@ pub enum FileError {
     Read {
         /// The file.
         path: String,
-        /// What the operating system said.
+        /// Reason given by the operating system.
         reason: String,
         /// What to do.
         fix: String,
     },
     /// The file cannot be written.
-    #[error("{path}: cannot be written: {reason}; choose another place or make this one writable")]
+    #[error("{path}: cannot be written: {reason}; choose another path or make this one writable")]
     Write {
         /// The file.
         path: String,
-        /// What the operating system said.
+        /// Reason given by the operating system.
         reason: String,
     },
-    /// The text is not TOML, or holds a key that does not belong there, or lacks one.
+    /// The text is not TOML, has an unknown key, or lacks a key.
     #[error("{path}:{line}:{column}: {problem}; every key is described in docs/FILES.md")]
     Syntax {
         /// The file.
@@ -35,59 +35,62 @@ pub enum FileError {
         /// What is wrong there.
         problem: String,
     },
-    /// A value cannot be what its key says.
+    /// The value of a key is invalid.
     #[error("{path}:{line}: `{key}` = {value}: {problem}; {fix}")]
     Value {
         /// The file.
         path: String,
-        /// Line of the key, counted from 1; 1 when the value belongs to the file as a whole.
+        /// Line of the key, counted from 1; 1 if the value belongs to the file as a whole.
         line: usize,
         /// The key, with its table.
         key: String,
-        /// The value found.
+        /// The value.
         value: String,
         /// What is wrong with it.
         problem: String,
         /// What to do.
         fix: String,
     },
-    /// Two files that must belong together do not.
+    /// Two files do not belong together.
     #[error("{path}: `{key}` is {found}, but {other} is {expected}; {fix}")]
     Mismatch {
-        /// The file that names the other.
+        /// The file that refers to the other.
         path: String,
         /// The key in it.
         key: String,
-        /// What it says.
+        /// Its value.
         found: String,
         /// The other file.
         other: String,
-        /// What that one is.
+        /// The value that belongs to the other file.
         expected: String,
         /// What to do.
         fix: String,
     },
 }
 
-/// Reads a whole text file of at most 16 MiB.
+/// Largest text file that is read, bytes: 16 MiB, far more than any file described in `docs/FILES.md` needs.
+const MAX_TEXT_BYTES: u64 = 16 << 20;
+
+/// Reads a text file of at most [`MAX_TEXT_BYTES`].
 pub(super) fn read_text(path: &Path) -> Result<String, FileError> {
     let name = path.display().to_string();
     let refuse = |reason: String, fix: &str| FileError::Read { path: name.clone(), reason, fix: fix.to_owned() };
     let meta = std::fs::metadata(path).map_err(|e| refuse(e.to_string(), "check the path"))?;
     if !meta.is_file() {
-        return Err(refuse("it is not a regular file".to_owned(), "name a TOML file"));
+        return Err(refuse("it is not a regular file".to_owned(), "give a TOML file"));
     }
-    if meta.len() > 16 << 20 {
+    if meta.len() > MAX_TEXT_BYTES {
         return Err(refuse(
-            format!("it has {} bytes", meta.len()),
-            "a file of this kind has less than 16 MiB; name the right one",
+            format!("it has {} bytes, more than the largest accepted file (16 MiB)", meta.len()),
+            "check that it is the intended file",
         ));
     }
     let bytes = std::fs::read(path).map_err(|e| refuse(e.to_string(), "check the path and its permissions"))?;
-    String::from_utf8(bytes).map_err(|_| refuse("it is not UTF-8 text".to_owned(), "name a TOML file, not an image"))
+    String::from_utf8(bytes).map_err(|_| refuse("it is not UTF-8 text".to_owned(), "give a TOML file, not an image"))
 }
 
-/// Writes a text file through a neighbour and a rename, so that a reader never sees half of it.
+/// Writes a text file next to its target and renames it, so that a reader never sees an incomplete file.
 pub(super) fn write_text(path: &Path, text: &str) -> Result<(), FileError> {
     let refuse = |e: std::io::Error| FileError::Write { path: path.display().to_string(), reason: e.to_string() };
     let mut part = path.as_os_str().to_owned();
@@ -95,20 +98,20 @@ pub(super) fn write_text(path: &Path, text: &str) -> Result<(), FileError> {
     let part = std::path::PathBuf::from(part);
     std::fs::write(&part, text).map_err(refuse)?;
     std::fs::rename(&part, path).map_err(|e| {
-        // The half-written neighbour is of no use to anyone; its own removal failing changes nothing.
+        // The error of the rename matters, not that of the clean-up.
         let _ = std::fs::remove_file(&part);
         refuse(e)
     })
 }
 
-/// A parsed text with what is needed to point into it.
+/// The text of a file and its name, to give errors a line and a key.
 pub(super) struct Source<'a> {
     pub(super) name: &'a str,
     pub(super) text: &'a str,
 }
 
 impl Source<'_> {
-    /// Parses into a serde mirror; errors carry line and column.
+    /// Deserializes the text; errors have line and column.
     pub(super) fn parse<T: serde::de::DeserializeOwned>(&self) -> Result<T, FileError> {
         toml::from_str(self.text).map_err(|e| {
             let at = e.span().map_or(0, |s| s.start.min(self.text.len()));
@@ -122,7 +125,7 @@ impl Source<'_> {
         })
     }
 
-    /// A refusal of the value at `key` ("left.fx", "mark[3].normal").
+    /// The error for the value at `key` ("left.fx", "mark[3].normal").
     pub(super) fn refuse(
         &self,
         key: &str,
@@ -140,7 +143,7 @@ impl Source<'_> {
         }
     }
 
-    /// The line on which a key stands, by a walk over table headers; 1 when it is not found.
+    /// The line of a key, found by walking over the table headers; 1 if it is not found.
     fn line_of(&self, key: &str) -> usize {
         let (table, leaf) = key.rsplit_once('.').unwrap_or(("", key));
         let mut here = String::new();
@@ -156,9 +159,9 @@ impl Source<'_> {
                 here = name.trim().to_owned();
             } else {
                 let name = line.split('=').next().unwrap_or("").trim();
-                let whole = if here.is_empty() { name.to_owned() } else { format!("{here}.{name}") };
-                // An inline table's keys are found on the line of the table.
-                if whole == key || (!table.is_empty() && whole == table) || (here == table && name == leaf) {
+                let full = if here.is_empty() { name.to_owned() } else { format!("{here}.{name}") };
+                // The keys of an inline table are on the line of the table.
+                if full == key || (!table.is_empty() && full == table) || (here == table && name == leaf) {
                     return k + 1;
                 }
             }
@@ -169,7 +172,7 @@ impl Source<'_> {
         header.unwrap_or(1)
     }
 
-    /// A finite number within a range.
+    /// Checks that a number is in a range, which NaN and infinity are not. `unit` describes the value in the fix.
     pub(super) fn number(
         &self,
         key: &str,
@@ -181,10 +184,10 @@ impl Source<'_> {
             return Ok(v);
         }
         let (a, b) = (range.start(), range.end());
-        Err(self.refuse(key, v, "outside what is possible", format!("give {unit} between {a} and {b}")))
+        Err(self.refuse(key, v, "outside the valid range", format!("give {unit} between {a} and {b}")))
     }
 
-    /// Three finite numbers within plus or minus `limit`.
+    /// Checks that three numbers are within plus or minus `limit`.
     pub(super) fn vector(
         &self,
         key: &str,
@@ -197,7 +200,7 @@ impl Source<'_> {
                 return Err(self.refuse(
                     key,
                     v,
-                    "outside what is possible",
+                    "outside the valid range",
                     format!("give three {unit} within plus or minus {limit}"),
                 ));
             }
@@ -213,8 +216,8 @@ impl Source<'_> {
         Err(self.refuse(
             "schema",
             found,
-            "this is another kind of file, or of another version",
-            format!("expected \"{expected}\": name the right file, or make it again with this version"),
+            "this is another kind of file, or one of another version",
+            format!("expected \"{expected}\": give the right file, or make it again with this version"),
         ))
     }
 }

@@ -1,4 +1,4 @@
-//! `gripper.toml`: the marks, what the jaws can take, and the shape of the gripper.
+//! `gripper.toml`: the marks, the range of the jaws, and the shape of the gripper.
 
 use super::boxes::OrientedBox;
 use super::error::{self, FileError, Source};
@@ -11,30 +11,35 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 const SCHEMA: &str = "graspd-gripper/1";
+/// Fewest marks that determine the gripper's pose without ambiguity.
+const MIN_MARKS: usize = 4;
+/// Smallest distance of at least one mark from the line through the others, metres: nearer marks leave the rotation
+/// about that line undetermined.
+const MIN_MARK_SPREAD_M: f64 = 2e-3;
 
-/// A gripper file: what the loop needs, and what planning and drawing need besides.
+/// The content of a gripper file: what the loop needs, and what planning and drawing need in addition.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GripperFile {
-    /// Marks and mounting, valid.
+    /// Marks and mounting.
     pub gripper: Gripper,
     /// A name for people.
     pub name: Option<String>,
     /// Smallest and largest distance between the finger pads, metres.
     pub opening: [f64; 2],
-    /// How far the fingers stand out in front of the palm along the approach, metres.
+    /// Length of the fingers in front of the palm along the approach, metres.
     pub finger_length: f64,
-    /// The fingers, which slide along x with the opening.
+    /// The fingers, which move along x with the opening.
     pub fingers: Vec<Finger>,
-    /// The rigid rest of the gripper, in the gripper frame.
+    /// The rigid part of the gripper, in the gripper frame.
     pub body: Vec<OrientedBox>,
 }
 
-/// One finger: a box that slides along x by half the opening.
+/// A finger: a box that moves along x by half the opening.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Finger {
-    /// +1 when it opens towards +x, -1 towards -x.
+    /// +1 if the finger opens towards +x, -1 if towards -x.
     pub side: f64,
-    /// The finger when the jaws are shut, in the gripper frame.
+    /// The finger of the closed jaws, in the gripper frame.
     pub closed: OrientedBox,
 }
 
@@ -97,11 +102,14 @@ struct RawBox {
 
 impl GripperFile {
     /// Reads and checks a gripper file.
+    ///
+    /// # Errors
+    /// Names the file, the line, the key and the fix.
     pub fn load(path: &Path) -> Result<Self, FileError> {
         Self::parse(&error::read_text(path)?, &path.display().to_string())
     }
 
-    /// Checks a gripper given as text; `name` stands for the file in errors.
+    /// As [`GripperFile::load`], from a text; `name` is the file's name in errors.
     pub fn parse(text: &str, name: &str) -> Result<Self, FileError> {
         let src = Source { name, text };
         let raw: Raw = src.parse()?;
@@ -111,8 +119,8 @@ impl GripperFile {
             return Err(src.refuse(
                 "opening_m",
                 raw.opening_m,
-                "not an opening",
-                "give [smallest, largest] in metres, 0 <= smallest < largest",
+                "it is not a range of openings",
+                "give [smallest, largest] in metres, 0 <= smallest < largest <= 10",
             ));
         }
         let finger_length = src.number("finger_length_m", raw.finger_length_m, 1e-4..=10.0, "metres")?;
@@ -121,15 +129,16 @@ impl GripperFile {
         for (i, m) in raw.mark.iter().enumerate() {
             let mark = mark(&src, i, m)?;
             if gripper.marks.push(mark).is_err() {
-                return Err(src.refuse("mark", raw.mark.len(), "too many marks", format!("keep at most {MAX_MARKS}")));
+                let fix = format!("give at most {MAX_MARKS}");
+                return Err(src.refuse("mark", raw.mark.len(), "there are too many marks", fix));
             }
         }
-        if gripper.marks.len() < 4 {
+        if gripper.marks.len() < MIN_MARKS {
             return Err(src.refuse(
                 "mark",
                 gripper.marks.len(),
-                "too few marks to find the gripper's pose",
-                "describe at least 4, not all on one line, in [[mark]] tables",
+                "there are too few marks to determine the gripper's pose",
+                format!("describe at least {MIN_MARKS}, not all on one line, in [[mark]] tables"),
             ));
         }
         check_layout(&src, &gripper.marks)?;
@@ -148,13 +157,13 @@ impl GripperFile {
         Ok(Self { gripper, name: raw.name, opening: raw.opening_m, finger_length, fingers, body })
     }
 
-    /// Every box of the gripper with the jaws this far open, in the gripper frame.
+    /// All boxes of the gripper for a jaw opening in metres, fingers first, in the gripper frame.
     pub fn boxes(&self, opening: f64) -> Vec<OrientedBox> {
         let slide = |f: &Finger| f.closed.moved(&Pose::translation(f.side * 0.5 * opening, 0.0, 0.0));
         self.fingers.iter().map(slide).chain(self.body.iter().copied()).collect()
     }
 
-    /// Hash of the gripper itself by the bits of its numbers, not of the file's comments or name.
+    /// Hash of the values by their bits. Comments and the name do not change it.
     pub fn hash(&self) -> ContentHash {
         let mut h = Numbers::new(SCHEMA);
         h.add(&self.opening);
@@ -184,7 +193,7 @@ impl GripperFile {
         h.finish()
     }
 
-    /// The file's text; the same gripper gives the same bytes.
+    /// The text of the file. Equal grippers give equal bytes.
     pub fn to_toml(&self) -> String {
         let raw = Raw {
             schema: SCHEMA.to_owned(),
@@ -244,15 +253,16 @@ fn mark(src: &Source<'_>, i: usize, m: &RawMark) -> Result<Mark, FileError> {
     let n = src.vector(&k("normal"), m.normal, 1e3, "numbers")?;
     let len = n.norm();
     if len < 1e-3 {
-        return Err(src.refuse(&k("normal"), m.normal, "no direction", "give the outward normal of the mark's face"));
+        let fix = "give the outward normal of the mark's face";
+        return Err(src.refuse(&k("normal"), m.normal, "its length is nearly 0", fix));
     }
-    // What we wrote ourselves comes back to the bit.
+    // No normalisation if it is not needed: a written file is read back bit for bit.
     let normal = if (len - 1.0).abs() < 1e-14 { n } else { n / len };
     let d = src.number(&k("diameter_m"), m.diameter_m, 1e-4..=1.0, "the diameter in metres")?;
     Ok(Mark { position, normal, radius: 0.5 * d, dark: m.polarity == Polarity::Dark })
 }
 
-/// Marks that coincide or all stand on one line cannot give a pose.
+/// Refuses marks that overlap or are all on one line: they do not determine a pose.
 fn check_layout(src: &Source<'_>, marks: &[Mark]) -> Result<(), FileError> {
     for (i, a) in marks.iter().enumerate() {
         for (j, b) in marks.iter().enumerate().skip(i + 1) {
@@ -272,12 +282,12 @@ fn check_layout(src: &Source<'_>, marks: &[Mark]) -> Result<(), FileError> {
         marks.iter().map(|m| m.position - mean).max_by(|a, b| a.norm().total_cmp(&b.norm())).unwrap_or_default();
     let spread =
         marks.iter().map(|m| (m.position - mean).cross(&first).norm() / first.norm().max(1e-12)).fold(0.0, f64::max);
-    if !(spread > 2e-3) {
+    if !(spread > MIN_MARK_SPREAD_M) {
         return Err(src.refuse(
             "mark",
             format!("{} marks within {:.1} mm of one line", marks.len(), spread * 1e3),
-            "their pose about that line cannot be seen",
-            "place at least one mark well off the line",
+            "the rotation about that line cannot be observed",
+            "move at least one mark away from the line",
         ));
     }
     Ok(())
@@ -296,8 +306,8 @@ fn raw_box(
         return Err(src.refuse(
             &format!("{key}.half_size_m"),
             half,
-            "a box needs three positive half sizes",
-            "give half of its edges in metres",
+            "the half sizes are not all positive",
+            "give half of the length of each edge in metres",
         ));
     }
     let rotation = match rot {
@@ -358,7 +368,7 @@ rotation_vector_rad = [0.1, 0.0, 0.0]
 "#;
 
     #[test]
-    fn what_is_written_is_read_back() {
+    fn a_written_file_is_read_back_unchanged() {
         let a = GripperFile::parse(TEXT, "g").unwrap();
         let b = GripperFile::parse(&a.to_toml(), "g").unwrap();
         assert_eq!(a.gripper.marks, b.gripper.marks);
@@ -368,7 +378,7 @@ rotation_vector_rad = [0.1, 0.0, 0.0]
     }
 
     #[test]
-    fn refusals_name_the_mark() {
+    fn errors_name_the_mark() {
         let show =
             |from: &str, to: &str| GripperFile::parse(&TEXT.replacen(from, to, 1), "g.toml").unwrap_err().to_string();
         let e = show("position_m = [0.04, 0.02, -0.11]", "position_m = [0.041, -0.02, -0.13]");

@@ -1,9 +1,9 @@
-//! Content hashes: what ties a plan to its rig, its gripper and its images.
+//! Content hashes: they identify the rig, the gripper and the images that a plan was made with.
 
 use sha2::{Digest, Sha256};
 use std::fmt;
 
-/// SHA-256 of a content; printed as hexadecimal.
+/// A SHA-256 hash, printed as hexadecimal digits.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ContentHash(pub [u8; 32]);
 
@@ -13,12 +13,12 @@ impl ContentHash {
         Self(Sha256::digest(bytes).into())
     }
 
-    /// The first eight bytes as a big-endian number: the short identity used in frames and set-points.
+    /// The first eight bytes as a big-endian number: the short identity in frames and set-points.
     pub fn short(&self) -> u64 {
         self.0.iter().take(8).fold(0, |a, b| (a << 8) | u64::from(*b))
     }
 
-    /// Reads 64 hexadecimal digits.
+    /// Parses 64 hexadecimal digits; `None` if the text is anything else.
     pub fn parse(text: &str) -> Option<Self> {
         let b = text.as_bytes();
         if b.len() != 64 {
@@ -46,7 +46,7 @@ impl fmt::Debug for ContentHash {
     }
 }
 
-/// A running hash of numbers, by their bits: what a rig or gripper *is*, whatever its file's comments say.
+/// A running hash over the bits of numbers. It identifies the values of a rig or gripper, not the comments of its file.
 pub(super) struct Numbers(Sha256);
 
 impl Numbers {
@@ -58,7 +58,7 @@ impl Numbers {
 
     pub(super) fn add(&mut self, values: &[f64]) {
         for v in values {
-            // Both zeros are one number.
+            // Negative zero hashes as zero.
             self.0.update((v + 0.0).to_bits().to_le_bytes());
         }
     }
@@ -73,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn known_answer_and_text_form() {
+    fn known_hash_and_its_text_form() {
         let h = ContentHash::of(b"abc");
         assert_eq!(h.to_string(), "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
         assert_eq!(h.short(), 0xba78_16bf_8f01_cfea);

@@ -1,4 +1,4 @@
-//! Where a part with a mesh stands: `pose.toml`, or points of it picked in both images, `picks.toml`.
+//! The pose of a part with a mesh: `pose.toml`, or points of it picked in both images, `picks.toml`.
 
 use super::error::{self, FileError, Source};
 use super::pose::PoseRecord;
@@ -6,14 +6,15 @@ use graspd_rt::geom::{Pixel, Pose, Vec3};
 use serde::Deserialize;
 use std::path::Path;
 
-/// A pose in the left camera's frame, with its doubt.
+/// A pose in the left camera's frame, with its uncertainty.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PoseFile {
-    /// The pose: `left_from_mesh` for a part, `left_from_gripper` for the present pose of a gripper, `left_from_base` for an arm.
+    /// The pose: `left_from_mesh` of a part, `left_from_gripper` of the gripper at present, or `left_from_base` of an
+    /// arm.
     pub pose: Pose,
     /// Standard deviation of each coordinate, metres, if stated.
     pub sigma_m: Option<f64>,
-    /// Standard deviation about each axis, radians, if stated.
+    /// Standard deviation of the rotation about each axis, radians, if stated.
     pub sigma_rad: Option<f64>,
 }
 
@@ -29,7 +30,7 @@ struct RawPose {
 }
 
 impl PoseFile {
-    /// Reads a pose file that holds the pose called `key`.
+    /// Reads the pose called `key` from a pose file.
     ///
     /// # Errors
     /// Names the file, the line, the key and the fix.
@@ -37,7 +38,7 @@ impl PoseFile {
         Self::parse(&error::read_text(path)?, &path.display().to_string(), key)
     }
 
-    /// The same from a text; `name` stands for the file in errors.
+    /// As [`PoseFile::load`], from a text; `name` is the file's name in errors.
     pub fn parse(text: &str, name: &str, key: &'static str) -> Result<Self, FileError> {
         let src = Source { name, text };
         let raw: RawPose = src.parse()?;
@@ -51,13 +52,13 @@ impl PoseFile {
             src.refuse(
                 key,
                 "nothing",
-                "the pose asked for is not in the file",
+                "the pose is missing",
                 format!("add `{key} = {{ translation_m = [...], quaternion_wxyz = [...] }}`"),
             )
         })?;
         let pose = record.pose(&src, key, 100.0)?;
-        let sigma = |key: &str, v: Option<f64>, most: f64, unit: &str| {
-            v.map(|v| src.number(key, v, 0.0..=most, unit)).transpose()
+        let sigma = |key: &str, v: Option<f64>, max: f64, unit: &str| {
+            v.map(|v| src.number(key, v, 0.0..=max, unit)).transpose()
         };
         Ok(Self {
             pose,
@@ -70,7 +71,7 @@ impl PoseFile {
 /// A point of a mesh and its pixels in both images.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pick {
-    /// The point in the mesh's frame, in the mesh file's unit.
+    /// The point in the mesh frame, in the unit of the mesh file.
     pub point: Vec3,
     /// Its pixel in the left image.
     pub left: Pixel,
@@ -79,7 +80,7 @@ pub struct Pick {
 }
 
 impl Pick {
-    /// Reads "X,Y,Z=UL,VL,UR,VR".
+    /// Parses "X,Y,Z=UL,VL,UR,VR"; `None` if the text is anything else.
     pub fn parse(text: &str) -> Option<Self> {
         let (point, pixels) = text.split_once('=')?;
         let numbers = |t: &str| -> Option<Vec<f64>> {
@@ -126,7 +127,7 @@ impl PicksFile {
         Self::parse(&error::read_text(path)?, &path.display().to_string())
     }
 
-    /// The same from a text; `name` stands for the file in errors.
+    /// As [`PicksFile::load`], from a text; `name` is the file's name in errors.
     pub fn parse(text: &str, name: &str) -> Result<Self, FileError> {
         let src = Source { name, text };
         let raw: RawPicks = src.parse()?;
@@ -139,8 +140,8 @@ impl PicksFile {
                     return Err(src.refuse(
                         &format!("pick[{k}].{key}"),
                         px,
-                        "this is no pixel",
-                        "give two finite numbers",
+                        "it is not a pixel",
+                        "give two numbers within plus or minus 100000",
                     ));
                 }
             }
@@ -155,7 +156,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn poses_and_picks_are_read_and_refusals_name_the_key() {
+    fn poses_and_picks_are_parsed_and_errors_name_the_key() {
         let pose = "schema = \"graspd-pose/1\"\nsigma_mm = 0.5\n[left_from_mesh]\ntranslation_m = [0.0, 0.1, 1.5]\nrotation_vector_rad = [0.0, 0.0, 1.0]\n";
         let p = PoseFile::parse(pose, "p.toml", "left_from_mesh").unwrap();
         assert_eq!((p.pose.translation.y, p.sigma_m, p.sigma_rad), (0.1, Some(0.5e-3), None));

@@ -1,9 +1,9 @@
-//! The three files of the off-line stage, read into values that are valid and written so that the same values give the same bytes.
+//! The files of the off-line stage: parsed into checked values, and written so that equal values give equal bytes.
 //!
-//! `rig.toml` holds the two cameras, `gripper.toml` the marks and the shape of the gripper, `plan.toml` the outcome: everything
-//! the loop needs, and everything a person wants to know about how it came about. Every key is described in `docs/FILES.md`.
-//! Unknown keys, missing keys, numbers that are no measurement and shapes that cannot be are refused with the file, the line,
-//! the key and what to do about it; nothing downstream validates again.
+//! `rig.toml` holds the two cameras, `gripper.toml` the marks and the shape of the gripper, and `plan.toml` the result:
+//! the set-point of the on-line stage, and how it was computed. `pose.toml` and `picks.toml` give the pose of a part
+//! with a mesh. Every key is described in `docs/FILES.md`. Unknown keys, missing keys, NaN, infinity and impossible
+//! shapes are refused with the file, the line, the key and the fix; nothing downstream validates again.
 
 mod boxes;
 mod error;

@@ -1,9 +1,8 @@
-//! A program's outputs must not be its inputs: what is about to be written is held against what was read, by the file
-//! and not by its name.
+//! The outputs of a command must not overwrite its inputs. Files are compared by identity, not by name.
 
 use std::path::{Path, PathBuf};
 
-/// Refuses an output that is one of the inputs, or another output. Names are the options that gave the paths.
+/// Checks that no output is the same file as an input or another output. Each path comes with the option that gave it.
 ///
 /// # Errors
 /// One sentence with both options and the file.
@@ -15,7 +14,7 @@ pub fn keep_apart(outputs: &[(&str, Option<&Path>)], inputs: &[(&str, Option<&Pa
     for (option, path) in outputs {
         if let Some((other, _)) = others.iter().find(|(_, o)| same_file(&path, o)) {
             return Err(format!(
-                "{option} {} is the same file as {other}: it would be overwritten; choose another place for {option}",
+                "{option} {} is the same file as {other} and would overwrite it; choose another path for {option}",
                 path.display()
             ));
         }
@@ -24,14 +23,14 @@ pub fn keep_apart(outputs: &[(&str, Option<&Path>)], inputs: &[(&str, Option<&Pa
     Ok(())
 }
 
-/// Whether two paths lead to one file: by the file itself where both are there (links included), otherwise by their
-/// full names.
+/// Whether two paths name one file: by device and inode if both exist (which resolves links), otherwise by their
+/// absolute paths.
 fn same_file(a: &Path, b: &Path) -> bool {
     use std::os::unix::fs::MetadataExt as _;
     if let (Ok(x), Ok(y)) = (std::fs::metadata(a), std::fs::metadata(b)) {
         return (x.dev(), x.ino()) == (y.dev(), y.ino());
     }
-    // One of them is not there yet: its folder may be.
+    // At least one of them does not exist yet; resolve its folder instead.
     let full = |p: &Path| -> Option<PathBuf> {
         let p = std::path::absolute(p).ok()?;
         let folder = p.parent()?;
@@ -45,7 +44,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_file_is_one_file_by_any_name() {
+    fn a_file_is_recognised_by_every_name_and_link() {
         let dir = std::env::temp_dir().join(format!("graspd-outputs-{}", std::process::id()));
         let _ = std::fs::remove_dir_all(&dir);
         std::fs::create_dir_all(dir.join("sub")).unwrap();
@@ -57,13 +56,13 @@ mod tests {
         let check =
             |out: &str| keep_apart(&[("--out", Some(&dir.join(out)))], &[("--rig", Some(&rig)), ("--left", None)]);
         for bad in ["rig.toml", "soft.toml", "hard.toml", "sub/../rig.toml", "./rig.toml"] {
-            let said = check(bad).unwrap_err();
-            assert!(said.contains("--out") && said.contains("--rig") && said.contains(bad), "{said}");
+            let error = check(bad).unwrap_err();
+            assert!(error.contains("--out") && error.contains("--rig") && error.contains(bad), "{error}");
         }
         for good in ["other.toml", "new.toml", "sub/rig.toml"] {
             assert_eq!(check(good), Ok(()), "{good}");
         }
-        // Two outputs that do not exist yet, by two names.
+        // Two names of one output that does not exist yet.
         let (a, b) = (dir.join("new.png"), dir.join("sub/../new.png"));
         assert!(keep_apart(&[("--out", Some(&a)), ("--overlay", Some(&b))], &[]).unwrap_err().contains("--overlay"));
         std::fs::remove_dir_all(&dir).unwrap();

@@ -1,11 +1,11 @@
-//! A pose as it stands in a file.
+//! The record of a pose in a file.
 
 use super::error::{FileError, Source};
 use graspd_rt::geom::Pose;
 use nalgebra::{Quaternion, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
-/// A pose `a_from_b` in a file: translation in metres, and the rotation as a quaternion or as a rotation vector (exactly one).
+/// A pose `a_from_b` in a file: a translation, and exactly one of a quaternion and a rotation vector.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PoseRecord {
@@ -14,17 +14,17 @@ pub struct PoseRecord {
     /// Unit quaternion, scalar first.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub quaternion_wxyz: Option<[f64; 4]>,
-    /// Axis times angle, radians.
+    /// Rotation vector (axis times angle), radians.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rotation_vector_rad: Option<[f64; 3]>,
 }
 
 impl PoseRecord {
-    /// The record of a pose, rotation as a quaternion with a positive scalar part.
+    /// The record of a pose, with the rotation as a quaternion whose scalar part is not negative.
     pub fn of(p: &Pose) -> Self {
         let q = p.rotation.quaternion();
         let s = if q.w < 0.0 { -1.0 } else { 1.0 };
-        // Adding zero turns a negative zero into zero: the same pose, the same bytes.
+        // Adding zero turns negative zero into zero, so that equal poses give equal bytes.
         Self {
             translation_m: [p.translation.x + 0.0, p.translation.y + 0.0, p.translation.z + 0.0],
             quaternion_wxyz: Some([s * q.w + 0.0, s * q.i + 0.0, s * q.j + 0.0, s * q.k + 0.0]),
@@ -32,7 +32,7 @@ impl PoseRecord {
         }
     }
 
-    /// The pose, checked; `limit_m` bounds each coordinate of the translation.
+    /// Checks the record and converts it to a pose. `limit_m` bounds each coordinate of the translation, metres.
     pub(super) fn pose(&self, src: &Source<'_>, key: &str, limit_m: f64) -> Result<Pose, FileError> {
         let t = src.vector(&format!("{key}.translation_m"), self.translation_m, limit_m, "metres")?;
         let rotation = match (self.quaternion_wxyz, self.rotation_vector_rad) {
@@ -43,11 +43,11 @@ impl PoseRecord {
                     return Err(src.refuse(
                         &format!("{key}.quaternion_wxyz"),
                         [w, i, j, k],
-                        format!("its length is {n:.6}"),
+                        format!("its length is {n:.6}, not 1"),
                         "give a unit quaternion, scalar first",
                     ));
                 }
-                // What we wrote ourselves comes back to the bit.
+                // No normalisation if it is not needed: a written file is read back bit for bit.
                 if (n - 1.0).abs() < 1e-14 {
                     UnitQuaternion::new_unchecked(q)
                 } else {
@@ -62,8 +62,8 @@ impl PoseRecord {
                 return Err(src.refuse(
                     key,
                     "two rotations",
-                    "it has a quaternion and a rotation vector",
-                    "leave one of them out",
+                    "both a quaternion and a rotation vector are given",
+                    "remove one of them",
                 ));
             }
             (None, None) => {

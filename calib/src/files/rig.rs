@@ -9,45 +9,45 @@ use std::path::Path;
 
 const SCHEMA: &str = "graspd-rig/1";
 
-/// A rig file: the calibrated rig, and what is known about where it came from.
+/// The content of a rig file: the calibrated rig, and data about its calibration.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RigFile {
-    /// The rig, valid.
+    /// The rig.
     pub rig: Rig,
     /// A name for people.
     pub name: Option<String>,
-    /// When it was calibrated, as text.
+    /// Date of the calibration, as text.
     pub date: Option<String>,
-    /// How well the calibration fits.
+    /// Quality of the calibration.
     pub quality: Option<Quality>,
 }
 
-/// How well a calibration fits its images.
+/// Quality of a calibration. The standard deviations are those of the rig's error.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Quality {
-    /// Root mean square reprojection error of the images used, pixels.
+    /// Root mean square reprojection error in the images used, pixels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rms_px: Option<f64>,
-    /// The same on images kept aside.
+    /// Root mean square reprojection error in hold-out images, pixels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub holdout_rms_px: Option<f64>,
     /// Number of image pairs used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub images: Option<u32>,
-    /// One standard deviation of the relative rotation about each axis, rad.
+    /// Standard deviation of the relative rotation about each axis, radians.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rotation_rad: Option<f64>,
-    /// The same of the focal lengths, both together, relative.
+    /// Relative standard deviation of the focal length common to both cameras.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub focal: Option<f64>,
-    /// The same of half their difference, relative.
+    /// Relative standard deviation of half the difference of the focal lengths.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub focal_difference: Option<f64>,
-    /// The same of each principal point's coordinates, pixels.
+    /// Standard deviation of each coordinate of the principal points, pixels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub principal_px: Option<f64>,
-    /// Anything else worth keeping.
+    /// Free text.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub note: Option<String>,
 }
@@ -101,11 +101,14 @@ impl RawDistortion {
 
 impl RigFile {
     /// Reads and checks a rig file.
+    ///
+    /// # Errors
+    /// Names the file, the line, the key and the fix.
     pub fn load(path: &Path) -> Result<Self, FileError> {
         Self::parse(&error::read_text(path)?, &path.display().to_string())
     }
 
-    /// Checks a rig given as text; `name` stands for the file in errors.
+    /// As [`RigFile::load`], from a text; `name` is the file's name in errors.
     pub fn parse(text: &str, name: &str) -> Result<Self, FileError> {
         let src = Source { name, text };
         let raw: Raw = src.parse()?;
@@ -118,7 +121,7 @@ impl RigFile {
             return Err(src.refuse(
                 "right_from_left.translation_m",
                 raw.right_from_left.translation_m,
-                "the two cameras stand in one place, so depth cannot be seen",
+                "the two cameras are at one position, so depth cannot be measured",
                 "give the translation in metres from a stereo calibration",
             ));
         }
@@ -128,12 +131,12 @@ impl RigFile {
         Ok(Self { rig: Rig { left, right, right_from_left }, name: raw.name, date: raw.date, quality: raw.quality })
     }
 
-    /// A rig without a history.
+    /// A rig without data about its calibration.
     pub fn new(rig: Rig) -> Self {
         Self { rig, name: None, date: None, quality: None }
     }
 
-    /// The rig's own error as the file states it; the default for every figure that it does not state.
+    /// The rig's error as stated in the file; the default for every value that is not stated.
     pub fn error(&self) -> RigError {
         let d = RigError::default();
         self.quality.as_ref().map_or(d, |q| RigError {
@@ -144,7 +147,7 @@ impl RigFile {
         })
     }
 
-    /// Hash of the calibration itself: cameras and relative pose by their bits, not the file's comments, name or date.
+    /// Hash of the cameras and their relative pose by their bits. Comments, name, date and quality do not change it.
     pub fn hash(&self) -> ContentHash {
         let mut h = Numbers::new(SCHEMA);
         for c in [&self.rig.left, &self.rig.right] {
@@ -163,7 +166,7 @@ impl RigFile {
         self.hash().short()
     }
 
-    /// The file's text; the same rig gives the same bytes.
+    /// The text of the file. Equal rigs give equal bytes.
     pub fn to_toml(&self) -> String {
         let raw = Raw {
             schema: SCHEMA.to_owned(),
@@ -186,10 +189,10 @@ impl RigFile {
     }
 }
 
-/// Refuses a stated error that no calibration has: zero would take every gate away from noise, and beyond the upper ends a rig is
-/// not calibrated but guessed.
+/// Checks the stated error of the rig. Zero would leave the gates without any allowance for the rig's error; a rig
+/// whose error exceeds the upper limits is not calibrated.
 fn stated_error(src: &Source<'_>, q: &Quality) -> Result<(), FileError> {
-    let figures = [
+    let values = [
         (
             "rotation_rad",
             q.rotation_rad,
@@ -205,7 +208,7 @@ fn stated_error(src: &Source<'_>, q: &Quality) -> Result<(), FileError> {
         ),
         ("principal_px", q.principal_px, 1e-3..=50.0, "one standard deviation of the principal points, pixels"),
     ];
-    for (leaf, value, range, what) in figures {
+    for (leaf, value, range, what) in values {
         if let Some(v) = value {
             src.number(&format!("quality.{leaf}"), v, range, what)?;
         }
@@ -239,15 +242,10 @@ fn camera(src: &Source<'_>, key: &str, r: &RawCamera) -> Result<Camera, FileErro
     };
     let k = |leaf: &str| format!("{key}.{leaf}");
     if r.width == 0 || r.width > 65_535 {
-        return Err(src.refuse(&k("width"), r.width, "not an image's width", "give the width in pixels, 1 to 65535"));
+        return Err(src.refuse(&k("width"), r.width, "it is not an image width", "give pixels, 1 to 65535"));
     }
     if r.height == 0 || r.height > 65_535 {
-        return Err(src.refuse(
-            &k("height"),
-            r.height,
-            "not an image's height",
-            "give the height in pixels, 1 to 65535",
-        ));
+        return Err(src.refuse(&k("height"), r.height, "it is not an image height", "give pixels, 1 to 65535"));
     }
     for (leaf, v) in [("fx", r.fx), ("fy", r.fy)] {
         src.number(&k(leaf), v, 1.0..=1e6, "the focal length in pixels")?;
@@ -264,14 +262,16 @@ fn camera(src: &Source<'_>, key: &str, r: &RawCamera) -> Result<Camera, FileErro
         CameraError::Folds => src.refuse(
             &k("distortion"),
             [d.k1, d.k2, d.p1, d.p2, d.k3],
-            "this lens model folds the image over itself, so that a pixel has no unique ray",
-            "check the order k1, k2, p1, p2, k3 and the signs, or calibrate with points out to the image's corners",
+            "the lens model folds the image over itself, so that a pixel has no unique ray",
+            "check the order k1, k2, p1, p2, k3 and the signs, or calibrate with points up to the image corners",
         ),
         CameraError::NotFinite => {
-            src.refuse(key, "a number that is not finite", "not a measurement", "calibrate again")
+            src.refuse(key, "NaN or infinity", "a parameter is not finite", "calibrate the camera again")
         }
-        CameraError::FocalLength => src.refuse(&k("fx"), [r.fx, r.fy], "not a focal length", "give pixels"),
-        CameraError::ImageSize => src.refuse(&k("width"), [r.width, r.height], "not an image size", "give pixels"),
+        CameraError::FocalLength => src.refuse(&k("fx"), [r.fx, r.fy], "it is not a focal length", "give pixels"),
+        CameraError::ImageSize => {
+            src.refuse(&k("width"), [r.width, r.height], "it is not an image size", "give pixels")
+        }
     })
 }
 
@@ -306,7 +306,7 @@ rotation_vector_rad = [0.0, 0.3, 0.0]
 "#;
 
     #[test]
-    fn what_is_written_is_read_back_to_the_bit() {
+    fn a_written_file_is_read_back_bit_for_bit() {
         let a = RigFile::parse(TEXT, "rig.toml").unwrap();
         let text = a.to_toml();
         let b = RigFile::parse(&text, "rig.toml").unwrap();
@@ -316,7 +316,7 @@ rotation_vector_rad = [0.0, 0.3, 0.0]
     }
 
     #[test]
-    fn the_identity_is_the_calibration_not_the_comments() {
+    fn the_identity_depends_on_the_calibration_only() {
         let a = RigFile::parse(TEXT, "rig.toml").unwrap();
         let b = RigFile::parse(&TEXT.replace("bench", "other"), "rig.toml").unwrap();
         let c = RigFile::parse(&TEXT.replace("1199.5", "1199.6"), "rig.toml").unwrap();
@@ -325,13 +325,13 @@ rotation_vector_rad = [0.0, 0.3, 0.0]
     }
 
     #[test]
-    fn the_stated_error_is_read_and_the_default_fills_what_is_not_stated() {
+    fn the_stated_error_is_read_and_defaults_fill_the_rest() {
         let a = RigFile::parse(TEXT, "rig.toml").unwrap();
         assert_eq!(a.error(), RigError::default());
         let text = format!("{TEXT}\n[quality]\nrotation_rad = 2e-4\nprincipal_px = 0.3\n");
         let b = RigFile::parse(&text, "rig.toml").unwrap();
         assert_eq!(b.error(), RigError { rotation_rad: 2e-4, principal_px: 0.3, ..RigError::default() });
-        // How good a calibration is does not make it another one, and it survives writing.
+        // The quality does not change the identity, and it survives writing.
         assert_eq!(a.id(), b.id());
         assert_eq!(RigFile::parse(&b.to_toml(), "rig.toml").unwrap().error(), b.error());
         for bad in ["rotation_rad = 0.1", "focal = 0.0", "principal_px = nan", "focal_difference = -0.001"] {
@@ -342,7 +342,7 @@ rotation_vector_rad = [0.0, 0.3, 0.0]
     }
 
     #[test]
-    fn refusals_name_file_line_key_and_fix() {
+    fn errors_name_file_line_key_and_fix() {
         let show = |from: &str, to: &str| RigFile::parse(&TEXT.replace(from, to), "rig.toml").unwrap_err().to_string();
         let e = show("fy = 1199.5", "fy = -3.0");
         assert!(e.starts_with("rig.toml:9: `left.fy` = -3.0") && e.contains("focal length in pixels between"), "{e}");
@@ -353,7 +353,7 @@ rotation_vector_rad = [0.0, 0.3, 0.0]
         let e = show("k1 = -0.2", "k1 = -5.0");
         assert!(e.contains("left.distortion") && e.contains("folds"), "{e}");
         let e = show("[-0.5, 0.0, 0.02]", "[0.0, 0.0, 0.0]");
-        assert!(e.contains("right_from_left.translation_m") && e.contains("one place"), "{e}");
+        assert!(e.contains("right_from_left.translation_m") && e.contains("one position"), "{e}");
         let e = show("graspd-rig/1", "graspd-gripper/1");
         assert!(e.contains("schema") && e.contains("another kind of file"), "{e}");
         let e = show("height = 1024\nfx = 1200.0\nfy = 1199.5", "fx = 1200.0\nfy = 1199.5");

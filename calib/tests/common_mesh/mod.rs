@@ -1,8 +1,9 @@
-//! Parts for the tests of polyhedral handles: built from boxes, so that what is solid is known without the mesh, and written as files.
+//! Parts for the tests of polyhedral handles: built from boxes, so that the solid is known without the mesh, and
+//! written as files.
 #![allow(dead_code, clippy::unwrap_used)] // shared by test programs, each of which uses some of it
 
-use graspd_calib::mesh_cli::{MeshRequest, run};
-use graspd_calib::plan_cli::Class;
+use graspd_calib::commands::Class;
+use graspd_calib::commands::mesh::{MeshRequest, run};
 use graspd_rt::geom::{Pose, Vec3};
 use nalgebra::{Point3, Quaternion, UnitQuaternion};
 use rand::SeedableRng;
@@ -14,7 +15,8 @@ pub(crate) const RIG: &str = "schema = \"graspd-rig/1\"\n\
 [right]\nwidth = 1280\nheight = 1024\nfx = 1190.0\nfy = 1190.0\ncx = 630.0\ncy = 520.0\n\
 [right_from_left]\ntranslation_m = [-0.48, 0.0, 0.08]\nrotation_vector_rad = [0.0, 0.32, 0.0]\n";
 
-/// Half width and thickness of a finger, its length, half sizes of the body: millimetres. The gripper's tips are at its origin.
+/// A gripper, millimetres: largest opening, half width, thickness and length of a finger. The tips are at the gripper's
+/// origin.
 #[derive(Clone, Copy)]
 pub(crate) struct Jaw {
     pub(crate) max: f64,
@@ -57,7 +59,7 @@ impl Jaw {
         out + &format!("[[body]]\ncentre_m = {c:?}\nhalf_size_m = {h:?}\n")
     }
 
-    /// Its boxes open to a width, in the gripper frame, millimetres; the fingers first.
+    /// The boxes of the gripper for an opening, in the gripper frame, millimetres; fingers first.
     pub(crate) fn boxes(&self, width: f64) -> [[[f64; 3]; 2]; 3] {
         let w = 0.5 * width;
         [
@@ -71,7 +73,7 @@ impl Jaw {
 pub(crate) type Corners = Vec<[[f64; 3]; 3]>;
 pub(crate) type Block = [[f64; 3]; 2];
 
-/// The union of boxes, less other boxes, millimetres.
+/// A union of boxes minus other boxes, millimetres.
 #[derive(Clone)]
 pub(crate) struct Solid {
     pub(crate) add: Vec<Block>,
@@ -91,7 +93,7 @@ impl Solid {
         Self::on(add, cut, lines)
     }
 
-    /// The same on a lattice of its own.
+    /// The solid on a given lattice.
     fn on(add: Vec<Block>, cut: Vec<Block>, lines: [Vec<f64>; 3]) -> Self {
         let mut out = Self { add, cut, lines, full: Vec::new() };
         let n = [0, 1, 2].map(|k| out.lines[k].len() - 1);
@@ -114,7 +116,7 @@ impl Solid {
             && self.full[at[0] as usize + n[0] * (at[1] as usize + n[1] * at[2] as usize)]
     }
 
-    /// Its full cells.
+    /// The cells inside the solid.
     pub(crate) fn cells(&self) -> Vec<Block> {
         let n = self.size();
         (0..self.full.len())
@@ -126,7 +128,7 @@ impl Solid {
             .collect()
     }
 
-    /// Its surface as quads, outwards.
+    /// The surface as quads with outward normals.
     pub(crate) fn quads(&self) -> Vec<[[f64; 3]; 4]> {
         let n = self.size();
         let mut out = Vec::new();
@@ -137,9 +139,9 @@ impl Solid {
             }
             for axis in 0..3 {
                 for up in [false, true] {
-                    let mut beside = at;
-                    beside[axis] += if up { 1 } else { -1 };
-                    if self.is(beside) {
+                    let mut next = at;
+                    next[axis] += if up { 1 } else { -1 };
+                    if self.is(next) {
                         continue;
                     }
                     let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
@@ -158,15 +160,15 @@ impl Solid {
         out
     }
 
-    /// Rectangles of its surface towards one side of an axis, each with its place along it.
+    /// Rectangles of the surface facing one side of an axis, each with its position along the axis.
     fn patches(&self, axis: usize, up: bool) -> Vec<(f64, Block)> {
         let n = self.size();
         let mut out = Vec::new();
         for i in 0..self.full.len() {
             let at = [i % n[0], i / n[0] % n[1], i / n[0] / n[1]];
-            let mut beside = at.map(|v| v as i64);
-            beside[axis] += if up { 1 } else { -1 };
-            if self.full[i] && !self.is(beside) {
+            let mut next = at.map(|v| v as i64);
+            next[axis] += if up { 1 } else { -1 };
+            if self.full[i] && !self.is(next) {
                 let b = [[0, 1, 2].map(|k| self.lines[k][at[k]]), [0, 1, 2].map(|k| self.lines[k][at[k] + 1])];
                 out.push((b[usize::from(up)][axis], b));
             }
@@ -178,7 +180,8 @@ impl Solid {
         self.quads().iter().flat_map(|q| [[q[0], q[1], q[2]], [q[0], q[2], q[3]]]).collect()
     }
 
-    /// A scan with triangles of very different sizes and shapes, as a decimated one has: cut along `n` random planes across each axis.
+    /// A scan with triangles of very different sizes and shapes, as after decimation: cut along `n` random planes
+    /// across each axis.
     pub(crate) fn uneven(&self, n: usize, noise: f64, seed: u64) -> Corners {
         use rand::RngExt;
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
@@ -191,7 +194,7 @@ impl Solid {
         Self::on(self.add.clone(), self.cut.clone(), lines).scan(1e9, noise, seed)
     }
 
-    /// Its surface cut into triangles with sides of about `step` millimetres, each vertex off by Gaussian noise: a scan.
+    /// A scan: the surface in triangles with sides of about `step` millimetres and Gaussian noise on each vertex.
     pub(crate) fn scan(&self, step: f64, noise: f64, seed: u64) -> Corners {
         use rand_distr::{Distribution, Normal};
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
@@ -267,7 +270,7 @@ pub(crate) fn polygon(n: usize, radius: f64) -> Vec<[f64; 2]> {
         .collect()
 }
 
-/// A handle as the list tells it, millimetres, in the mesh's frame.
+/// A handle of the list, millimetres, in the mesh frame.
 #[derive(Clone, Debug)]
 pub(crate) struct Row {
     pub(crate) closing: Vec3,
@@ -276,12 +279,12 @@ pub(crate) struct Row {
     pub(crate) opening: f64,
     pub(crate) contact: f64,
     pub(crate) mesh_from_gripper: Pose,
-    /// What the gripper can be brought to, whether or not its marks are seen there.
+    /// Whether the gripper can be moved there, regardless of the visibility of its marks.
     pub(crate) free: bool,
     pub(crate) kind: String,
 }
 
-/// A folder of its own for each test, removed at its end.
+/// A temporary folder for each test, removed at its end.
 pub(crate) struct Folder(pub(crate) PathBuf);
 
 impl Folder {
@@ -313,7 +316,7 @@ impl Folder {
             mesh_pose: Some(self.0.join("pose.toml")),
             clearance: Some(CLEARANCE * 1e-3),
             contact_mm2: Some(CONTACT),
-            pregrasp: Some(WAY * 1e-3),
+            pregrasp: Some(APPROACH * 1e-3),
             list: true,
             ..Default::default()
         }
@@ -360,11 +363,15 @@ pub(crate) fn rows(json: &serde_json::Value) -> Vec<Row> {
         .collect()
 }
 
+/// Clearance of each claw, millimetres.
 pub(crate) const CLEARANCE: f64 = 1.5;
+/// Smallest contact of each claw, square millimetres.
 pub(crate) const CONTACT: f64 = 40.0;
-pub(crate) const WAY: f64 = 50.0;
+/// Length of the approach, millimetres.
+pub(crate) const APPROACH: f64 = 50.0;
 
-/// A grasp with its axes along those of the part: axis of closing, axis and sign of the approach, the two faces, in tenths of a millimetre.
+/// A grasp with its axes along those of the part: axis of closing, axis and sign of the approach, and the positions of
+/// the two faces in tenths of a millimetre.
 pub(crate) type Key = (usize, usize, bool, i64, i64);
 
 pub(crate) fn key(r: &Row) -> Key {
@@ -374,8 +381,9 @@ pub(crate) fn key(r: &Row) -> Key {
     (c, a, r.approach[a] > 0.0, tenth(at - 0.5 * r.width), tenth(at + 0.5 * r.width))
 }
 
-/// Every grasp of a solid of boxes with the gripper along its axes, found by trying positions a millimetre apart; contact and collisions of
-/// boxes with boxes are exact. `strict` asks for a little more contact and air than the plan does, otherwise for a little less.
+/// All axis-parallel grasps of a solid of boxes, by exhaustive search with steps of a millimetre. Contact and
+/// collisions of boxes with boxes are exact. With `strict` they need a little more contact and clearance than the plan,
+/// otherwise a little less.
 pub(crate) fn brute(solid: &Solid, jaw: &Jaw, strict: bool) -> BTreeSet<Key> {
     let more = if strict { 1.0 } else { -1.0 };
     let cells = solid.cells();
@@ -395,7 +403,7 @@ pub(crate) fn brute(solid: &Solid, jaw: &Jaw, strict: bool) -> BTreeSet<Key> {
             let on = |k: usize, plane: i64| {
                 patches[k].iter().filter(move |(at, _)| (at * 10.0).round() as i64 == plane).map(|p| p.1)
             };
-            // What both faces share, as rectangles across and along the approach.
+            // The overlap of both faces, as rectangles across and along the approach.
             let shared: Vec<[[f64; 2]; 2]> = on(0, top)
                 .flat_map(|p| {
                     on(1, bottom).map(move |q| {
@@ -417,7 +425,7 @@ pub(crate) fn brute(solid: &Solid, jaw: &Jaw, strict: bool) -> BTreeSet<Key> {
                 shared.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), r| (l.min(r[0][k]), h.max(r[1][k])))
             };
             let (across, along) = (range(0), range(1));
-            // The gripper's y is approach x closing; turned half round, x and y point the other way.
+            // The gripper's y is approach x closing; half a turn reverses x and y.
             let y = if (a + 1) % 3 == c { sign } else { -sign };
             let free = |side: f64, tip: f64| {
                 let pad = [[side - jaw.half, tip - jaw.length], [side + jaw.half, tip]];
@@ -435,20 +443,22 @@ pub(crate) fn brute(solid: &Solid, jaw: &Jaw, strict: bool) -> BTreeSet<Key> {
                 if strict && tip - near > jaw.length - 1.3 {
                     return false;
                 }
-                let place = |q: &Block, way: f64, air: f64, roll: f64| {
+                let moved = |q: &Block, travel: f64, margin: f64, roll: f64| {
                     let mut out = [[0.0; 3]; 2];
                     let mut put = |axis: usize, at: f64, s: f64, l: f64, h: f64| {
                         let (p, r) = (at + s * l, at + s * h);
-                        (out[0][axis], out[1][axis]) = (p.min(r) - air, p.max(r) + air);
+                        (out[0][axis], out[1][axis]) = (p.min(r) - margin, p.max(r) + margin);
                     };
                     put(c, 0.5 * (t + u), roll, q[0][0], q[1][0]);
                     put(b, side, y * roll, q[0][1], q[1][1]);
-                    put(a, sign * tip, sign, q[0][2] - way, q[1][2]);
+                    put(a, sign * tip, sign, q[0][2] - travel, q[1][2]);
                     out
                 };
                 [1.0, -1.0].iter().any(|roll| {
-                    let way = jaw.boxes(opening).iter().all(|q| !meets(&place(q, WAY, 0.5 + 0.2 * more, *roll)));
-                    way && jaw.boxes(t - u + 1.0 - 0.6 * more)[..2].iter().all(|q| !meets(&place(q, 0.0, 0.0, *roll)))
+                    let approach =
+                        jaw.boxes(opening).iter().all(|q| !meets(&moved(q, APPROACH, 0.5 + 0.2 * more, *roll)));
+                    approach
+                        && jaw.boxes(t - u + 1.0 - 0.6 * more)[..2].iter().all(|q| !meets(&moved(q, 0.0, 0.0, *roll)))
                 })
             };
             let steps = |(l, h): (f64, f64)| (0..=((h - l) as i64)).map(move |k| l + k as f64);

@@ -2,8 +2,8 @@
 
 use super::args::PlanArgs;
 use clap::Args;
-use graspd_calib::mesh_cli::{MeshRequest, run};
-use graspd_calib::plan_cli::Outcome;
+use graspd_calib::commands::Outcome;
+use graspd_calib::commands::mesh::{MeshRequest, run};
 use std::path::PathBuf;
 
 /// What concerns a mesh only.

@@ -2,9 +2,9 @@
 
 use super::args::PlanArgs;
 use crate::exit::{Exit, Failure};
+use graspd_calib::commands::plan::{PlanRequest, run};
+use graspd_calib::commands::{Class, Outcome, parse_pose};
 use graspd_calib::files::keep_apart;
-use graspd_calib::mesh_cli::parse_pose;
-use graspd_calib::plan_cli::{Class, Outcome, Request, run};
 use std::io::Write as _;
 use std::path::Path;
 
@@ -29,7 +29,7 @@ pub fn plan(args: &PlanArgs) -> Result<Exit, Failure> {
         }
         deg => deg.map(f64::to_radians),
     };
-    let outcome = run(&Request {
+    let outcome = run(&PlanRequest {
         left: args.left.clone().unwrap_or_default(),
         right: args.right.clone().unwrap_or_default(),
         rig: args.rig.clone(),

@@ -11,7 +11,7 @@ pub fn study(args: &StudyArgs) -> Result<Exit, Failure> {
     if args.trials == 0 || args.trials > 1_000_000 {
         return Err(Failure { exit: Exit::Usage, message: format!("--trials {}: give 1 to 1000000", args.trials) });
     }
-    let all = graspd_calib::montecarlo::cells();
+    let all = graspd_calib::commands::study::cells();
     let cells: Vec<_> = match &args.cell {
         Some(name) => all.iter().filter(|c| c.name.contains(name.as_str())).copied().collect(),
         None => all.clone(),
@@ -24,7 +24,7 @@ pub fn study(args: &StudyArgs) -> Result<Exit, Failure> {
             message: format!("--cell {asked}: the cells are {}", names.join("; ")),
         });
     }
-    let table = graspd_calib::montecarlo::table(&cells, args.trials, args.seed, |cell| eprintln!("{cell}"));
+    let table = graspd_calib::commands::study::table(&cells, args.trials, args.seed, |cell| eprintln!("{cell}"));
     print!("{table}");
     Ok(Exit::Done)
 }

@@ -1,7 +1,8 @@
 //! A simulated cell of processes for tests: a world on disk, a plan for it, and mock controller, scene and daemon as processes.
 #![allow(dead_code)] // every test uses its own part of it
 
-use graspd_calib::plan_cli::{Class, Request, run};
+use graspd_calib::commands::Class;
+use graspd_calib::commands::plan::{PlanRequest, run};
 use graspd_hil::scenario::{Options, Scenario};
 use graspd_rt::geom::View;
 use serde_json::Value;
@@ -105,7 +106,7 @@ impl World {
             renderer.image(view, &shot).save(folder.join(name)).unwrap();
         }
         let click = |eye: usize| Some(format!("{:.1},{:.1}", scenario.clicks[eye].x, scenario.clicks[eye].y));
-        let done = run(&Request {
+        let done = run(&PlanRequest {
             left: folder.join("left.png"),
             right: folder.join("right.png"),
             rig: folder.join("world/rig.toml"),
@@ -113,7 +114,7 @@ impl World {
             select_left: click(0),
             select_right: click(1),
             out: Some(folder.join("plan.toml")),
-            ..Request::default()
+            ..PlanRequest::default()
         });
         assert_eq!(done.class, Class::Done, "{}", done.text);
         // A loopback address of its own: no port of another test, nor of an outgoing connection, can be in the way.

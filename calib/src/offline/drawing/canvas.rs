@@ -1,4 +1,4 @@
-//! A small drawing kit: anti-aliased lines and areas, and labels from bitmap fonts.
+//! A canvas for anti-aliased lines and areas, and for text in bitmap fonts. Positions and widths are in canvas pixels.
 
 use embedded_graphics::Drawable;
 use embedded_graphics::draw_target::DrawTarget;
@@ -17,7 +17,7 @@ use tiny_skia::{
 /// A colour as red, green, blue, opacity (0 to 255).
 pub type Rgba = [u8; 4];
 
-/// The sizes of labels.
+/// The typefaces of text.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Face {
     /// Headings.
@@ -43,9 +43,9 @@ impl Face {
     }
 }
 
-/// A drawing.
+/// A drawing with opaque pixels.
 pub struct Canvas {
-    /// Its pixels, opaque.
+    /// The pixels.
     pub pixmap: Pixmap,
 }
 
@@ -57,14 +57,14 @@ fn paint([r, g, b, a]: Rgba) -> Paint<'static> {
 }
 
 impl Canvas {
-    /// An empty drawing of one colour; `None` when it would have no pixels or too many.
+    /// A canvas of one colour; `None` if it would have no pixels or too many.
     pub fn new(width: u32, height: u32, [r, g, b, a]: Rgba) -> Option<Self> {
         let mut pixmap = Pixmap::new(width, height)?;
         pixmap.fill(Color::from_rgba8(r, g, b, a));
         Some(Self { pixmap })
     }
 
-    /// A line through points; a gap in it where a point is missing.
+    /// A polyline with a gap at each missing point. `dash` is the length of a dash and of a gap.
     pub fn line(&mut self, points: &[Option<Pixel>], colour: Rgba, width: f64, dash: Option<[f64; 2]>) {
         let mut b = PathBuilder::new();
         let mut down = false;
@@ -140,22 +140,22 @@ impl Canvas {
         self.area(&[to, to - d * 1.3 * head + n * 0.55 * head, to - d * 1.3 * head - n * 0.55 * head], colour);
     }
 
-    /// A label whose top left corner is at a place; letters are `scale` times their bitmap.
+    /// Text with its top left corner at a position; `scale` magnifies the bitmap of the font.
     pub fn text(&mut self, at: Pixel, text: &str, face: Face, scale: u32, colour: Rgba) {
         let font = face.font();
         let style = MonoTextStyle::new(&font, BinaryColor::On);
-        let mut ink = Ink {
+        let mut target = TextTarget {
             pixmap: &mut self.pixmap,
             x: at.x.round() as i32,
             y: at.y.round() as i32,
             scale: scale.max(1),
             colour,
         };
-        // The ink takes every pixel, inside the drawing or not; it cannot fail.
-        let _ = Text::with_baseline(text, TextPoint::zero(), style, Baseline::Top).draw(&mut ink);
+        // The draw target ignores pixels outside the canvas; it cannot fail.
+        let _ = Text::with_baseline(text, TextPoint::zero(), style, Baseline::Top).draw(&mut target);
     }
 
-    /// A label with a dark rim, readable on any image; centred at a place.
+    /// Text with a dark outline, readable on any image, centred at a position.
     pub fn label(&mut self, at: Pixel, text: &str, face: Face, scale: u32, colour: Rgba) {
         let size = face.font().character_size;
         let s = f64::from(scale.max(1));
@@ -169,9 +169,9 @@ impl Canvas {
         self.text(top, text, face, scale, colour);
     }
 
-    /// Another drawing laid on this one, which it covers: neither lets anything show through.
+    /// Copies another canvas onto this one, with its top left corner at a position.
     pub fn place(&mut self, x: i32, y: i32, other: &Self) {
-        // Where it begins here, and what of it is cut off.
+        // The first row or column on this canvas, and the number of rows or columns that are cut off.
         let begin = |at: i32| (at.max(0) as usize, at.min(0).unsigned_abs() as usize);
         let ((x, left), (y, above)) = (begin(x), begin(y));
         let (own, width) = (self.pixmap.width().max(1) as usize, other.pixmap.width().max(1) as usize);
@@ -181,7 +181,7 @@ impl Canvas {
         }
     }
 
-    /// Fills the drawing with grey values, row by row, each times a factor (0 to 1).
+    /// Fills the canvas with grey values, row by row, each times a factor from 0 to 1.
     pub fn grey(&mut self, values: &[u8], factor: f64) {
         for (pixel, v) in self.pixmap.pixels_mut().iter_mut().zip(values) {
             let g = (f64::from(*v) * factor.clamp(0.0, 1.0)) as u8;
@@ -191,9 +191,10 @@ impl Canvas {
         }
     }
 
-    /// The drawing as a PNG file.
+    /// The canvas as a PNG file.
     pub fn png(&self) -> Option<Vec<u8>> {
-        // Nothing shows through, so the opacity is left out; and a file that is written on every plan is worth a fifth more bytes for a tenth of the time.
+        // The pixels are opaque, so there is no alpha channel. Fast compression takes a tenth of the time for a fifth
+        // more bytes.
         let opaque: Vec<u8> = self.pixmap.pixels().iter().flat_map(|p| [p.red(), p.green(), p.blue()]).collect();
         let mut file = Vec::new();
         PngEncoder::new_with_quality(&mut file, CompressionType::Fast, FilterType::Adaptive)
@@ -203,8 +204,8 @@ impl Canvas {
     }
 }
 
-/// The bitmap font's way onto the drawing.
-struct Ink<'a> {
+/// A draw target that maps the bitmap font to canvas pixels.
+struct TextTarget<'a> {
     pixmap: &'a mut Pixmap,
     x: i32,
     y: i32,
@@ -212,13 +213,13 @@ struct Ink<'a> {
     colour: Rgba,
 }
 
-impl OriginDimensions for Ink<'_> {
+impl OriginDimensions for TextTarget<'_> {
     fn size(&self) -> Size {
         Size::new(self.pixmap.width(), self.pixmap.height())
     }
 }
 
-impl DrawTarget for Ink<'_> {
+impl DrawTarget for TextTarget<'_> {
     type Color = BinaryColor;
     type Error = std::convert::Infallible;
 
@@ -241,7 +242,7 @@ impl DrawTarget for Ink<'_> {
                 if let Some(q) = self.pixmap.pixels_mut().get_mut((y * w + x) as usize) {
                     let mix = |new: u32, old: u8| ((new * a + u32::from(old) * (255 - a)) / 255) as u8;
                     let (r, g, b) = (mix(r, q.red()), mix(g, q.green()), mix(b, q.blue()));
-                    // Everything drawn on is opaque, so the colours need no premultiplication.
+                    // The canvas is opaque, so the colours need no premultiplication.
                     if let Some(c) = PremultipliedColorU8::from_rgba(r, g, b, 255) {
                         *q = c;
                     }

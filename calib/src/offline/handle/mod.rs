@@ -1,24 +1,26 @@
-//! Where a parallel gripper can take a rim (section 3.2, errata D): four positions on an ellipse, one free angle on a circle.
+//! Grasps of a parallel gripper on a rim (paper section 3.2): four positions on an ellipse, one free angle on a circle.
 //!
-//! Gripper frame: z along the approach, which is minus the rim's normal; x along the closing direction; origin on the rim's axis.
+//! Gripper frame: z along the approach, which is minus the rim's normal; x along the closing direction; origin on the
+//! axis of the rim.
 
 pub mod grasp;
 pub mod setpoint;
 pub mod visibility;
 
-use crate::offline::handle::visibility::{Eye, FlatMark, visibility};
+use crate::offline::handle::visibility::{FlatMark, PinholeCamera, visibility};
 use crate::offline::rim::circle::frame_of;
 use crate::offline::rim::model::Rim;
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use std::f64::consts::TAU;
 
-/// Flatness of the visibility below which the free angle is not determined by it.
+/// Smallest flatness ([`FreeAngle::flatness`]) at which the visibility determines the free angle.
 pub const FLAT: f64 = 0.05;
 
-/// Steps of the global search over the free angle (half a degree); a parabola refines.
+/// Steps of the global search over the free angle: half a degree each, refined by a parabola.
 const GRID: usize = 720;
 
-/// Gripper pose whose closing direction is `x` projected on the plane, `standoff` away from the rim's centre along its normal.
+/// Gripper pose whose closing direction is `x` projected to the rim's plane, at `standoff` from the rim's centre along
+/// its normal.
 pub fn gripper_pose(rim: &Rim, x: &Vector3<f64>, standoff: f64) -> Isometry3<f64> {
     let z = -rim.normal;
     let x = (x - z * z.dot(x)).normalize();
@@ -29,51 +31,52 @@ pub fn gripper_pose(rim: &Rim, x: &Vector3<f64>, standoff: f64) -> Isometry3<f64
     )
 }
 
-/// The free angle as one camera would choose it.
+/// The best free angle for one camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FreeAngle {
     /// Angle about the normal from `e1` of [`frame_of`], radians in `[0, 2 pi)`.
     pub phi: f64,
-    /// Sum of the marks' solid angles there, sr.
+    /// Sum of the marks' solid angles at that angle, steradians.
     pub visibility: f64,
-    /// Whether at some angle every mark is seen.
+    /// Whether all marks are visible at some angle.
     pub feasible: bool,
-    /// `(max - min) / max` of the visibility over the whole turn; below [`FLAT`] the angle is not determined.
+    /// `(max - min) / max` of the visibility over all angles; below [`FLAT`] it does not determine the angle.
     pub flatness: f64,
 }
 
 /// A grasp on a circle.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CircleGrasp {
-    /// What each camera would choose.
+    /// The best angle for each camera.
     pub per_camera: [FreeAngle; 2],
-    /// The camera that sees the marks better at its own choice: 0 left, 1 right.
+    /// The camera with the larger visibility at its best angle: 0 left, 1 right.
     pub camera: usize,
-    /// The chosen angle.
+    /// The chosen angle, radians.
     pub phi: f64,
-    /// The gripper's pose there.
+    /// The gripper pose at that angle.
     pub pose: Isometry3<f64>,
 }
 
-/// Closing direction at an angle about the normal.
+/// Unit closing direction at an angle (radians) about the normal, from `e1` of [`frame_of`].
 pub fn direction(rim: &Rim, phi: f64) -> Vector3<f64> {
     let f = frame_of(&rim.normal);
     f.column(0) * phi.cos() + f.column(1) * phi.sin()
 }
 
-/// Settles the free rotation about a circle's axis by maximum visibility, searched globally for each camera.
-pub fn grasp_circle(rim: &Rim, marks: &[FlatMark], eyes: &[Eye; 2], standoff: f64) -> CircleGrasp {
-    let per_camera = [0, 1].map(|k| free_angle(rim, marks, &eyes[k], standoff));
+/// Determines the free rotation about a circle's axis by maximum visibility, with a global search for each camera.
+pub fn grasp_circle(rim: &Rim, marks: &[FlatMark], cameras: &[PinholeCamera; 2], standoff: f64) -> CircleGrasp {
+    let per_camera = [0, 1].map(|k| free_angle(rim, marks, &cameras[k], standoff));
     let value = per_camera.map(|c| if c.feasible { c.visibility } else { -1.0 });
     let camera = usize::from(value[1] > value[0]);
     let phi = per_camera[camera].phi;
     CircleGrasp { per_camera, camera, phi, pose: gripper_pose(rim, &direction(rim, phi), standoff) }
 }
 
-/// The angle at which one camera sees the marks best among those at which it sees them all.
-pub fn free_angle(rim: &Rim, marks: &[FlatMark], eye: &Eye, standoff: f64) -> FreeAngle {
+/// The angle with the largest visibility for one camera, among the angles at which all marks are visible, if there are
+/// any.
+pub fn free_angle(rim: &Rim, marks: &[FlatMark], camera: &PinholeCamera, standoff: f64) -> FreeAngle {
     let step = TAU / GRID as f64;
-    let at = |phi: f64| visibility(&gripper_pose(rim, &direction(rim, phi), standoff), marks, eye);
+    let at = |phi: f64| visibility(&gripper_pose(rim, &direction(rim, phi), standoff), marks, camera);
     let grid: Vec<(f64, bool)> = (0..GRID).map(|i| at(i as f64 * step)).collect();
     let feasible = grid.iter().any(|(_, ok)| *ok);
     let mut best = 0;
@@ -104,24 +107,25 @@ pub fn free_angle(rim: &Rim, marks: &[FlatMark], eye: &Eye, standoff: f64) -> Fr
 /// One of the four grasps on an ellipse.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EllipseGrasp {
-    /// 0 to 3: closing axis along `+a, +b, -a, -b` (quarter turns about the normal).
+    /// 0 to 3: closing direction along `+a, +b, -a, -b` (quarter turns about the normal).
     pub index: usize,
-    /// The gripper's pose.
+    /// The gripper pose.
     pub pose: Isometry3<f64>,
-    /// Opening that the jaw needs: `2 a` or `2 b`.
+    /// Required jaw opening: `2 a` or `2 b`.
     pub opening: f64,
-    /// Sum of the marks' solid angles for each camera, sr.
+    /// Sum of the marks' solid angles for each camera, steradians.
     pub visibility: [f64; 2],
-    /// Whether each camera sees every mark and the jaw opens wide enough.
+    /// For each camera, whether it sees all marks and the jaws open wide enough.
     pub feasible: [bool; 2],
 }
 
-/// The four positions that align the gripper with an ellipse's axes. `half_widths` are those that the jaw must span (a bar adds its radius).
+/// The four grasps that align the gripper with the axes of an ellipse. `half_widths` are those that the jaws must span:
+/// the semi-axes, plus the radius of a bar.
 pub fn grasp_ellipse(
     rim: &Rim,
     half_widths: (f64, f64),
     marks: &[FlatMark],
-    eyes: &[Eye; 2],
+    cameras: &[PinholeCamera; 2],
     standoff: f64,
     max_opening: f64,
 ) -> [EllipseGrasp; 4] {
@@ -131,7 +135,7 @@ pub fn grasp_ellipse(
     sides.map(|(x, half)| {
         let pose = gripper_pose(rim, &x, standoff);
         let opening = 2.0 * half;
-        let seen = [0, 1].map(|k| visibility(&pose, marks, &eyes[k]));
+        let seen = [0, 1].map(|k| visibility(&pose, marks, &cameras[k]));
         index += 1;
         EllipseGrasp {
             index: index - 1,
@@ -160,33 +164,34 @@ mod tests {
     }
 
     #[test]
-    fn the_gripper_approaches_against_the_normal_and_turns_right_handed() {
+    fn the_gripper_approaches_against_the_normal_and_its_frame_is_right_handed() {
         let rim = rim_tilted(Vector3::new(0.0, 0.05, 1.5), 0.5, 0.3, 0.075, 0.06);
-        let eyes = rig(0.5, 1200.0, 1.5).map(|p| Eye::new(&p, [1280.0, 1024.0]).unwrap());
-        let four = grasp_ellipse(&rim, (rim.a, rim.b), &plate(0.6), &eyes, 0.1, 0.14);
+        let cameras = rig(0.5, 1200.0, 1.5).map(|p| PinholeCamera::new(&p, [1280.0, 1024.0]).unwrap());
+        let four = grasp_ellipse(&rim, (rim.a, rim.b), &plate(0.6), &cameras, 0.1, 0.14);
         for g in &four {
             assert!((g.pose.rotation * Vector3::z() + rim.normal).norm() < 1e-12);
             assert!((g.pose.translation.vector - rim.centre - rim.normal * 0.1).norm() < 1e-12);
         }
         assert!((four[1].pose.rotation * Vector3::x() - rim.axis_b).norm() < 1e-12);
-        // The jaw opens 140 mm: enough for the minor axis, not for the major one.
+        // The jaws open to 140 mm: enough for the minor axis, not for the major one.
         assert!(!four.map(|g| g.feasible[0] || g.feasible[1])[0]);
         assert!((four[0].opening - 0.15).abs() < 1e-12);
     }
 
     #[test]
-    fn the_chosen_angle_is_the_best_of_a_fine_search_and_a_flat_plate_leaves_it_open() {
+    fn the_chosen_angle_is_the_best_of_a_fine_search_and_a_flat_plate_does_not_determine_it() {
         let rim = rim_tilted(Vector3::new(0.02, 0.05, 1.5), 0.35, 0.9, 0.07, 0.07);
-        let eyes = rig(0.5, 1200.0, 1.5).map(|p| Eye::new(&p, [1280.0, 1024.0]).unwrap());
-        let grasp = grasp_circle(&rim, &plate(0.6), &eyes, 0.0);
+        let cameras = rig(0.5, 1200.0, 1.5).map(|p| PinholeCamera::new(&p, [1280.0, 1024.0]).unwrap());
+        let grasp = grasp_circle(&rim, &plate(0.6), &cameras, 0.0);
         let chosen = grasp.per_camera[grasp.camera];
         for i in 0..3600 {
             let phi = f64::from(i) * TAU / 3600.0;
-            let (v, ok) = visibility(&gripper_pose(&rim, &direction(&rim, phi), 0.0), &plate(0.6), &eyes[grasp.camera]);
+            let (v, ok) =
+                visibility(&gripper_pose(&rim, &direction(&rim, phi), 0.0), &plate(0.6), &cameras[grasp.camera]);
             assert!(!ok || v <= chosen.visibility * (1.0 + 1e-6), "{phi}");
         }
         assert!(chosen.flatness > FLAT);
-        let flat = grasp_circle(&rim, &plate(0.0), &eyes, 0.0);
+        let flat = grasp_circle(&rim, &plate(0.0), &cameras, 0.0);
         assert!(flat.per_camera[flat.camera].flatness < FLAT);
     }
 }

@@ -56,7 +56,7 @@ pub(super) fn assemble(
     let path = options.approach.present.map(|present| {
         let poses = [present, grasp.pregrasp, grasp.grasp];
         let [l, r] = fewest_on_the_way(&scene, &poses, 20);
-        if l.0 < grasp::LEAST_MARKS && r.0 < grasp::LEAST_MARKS {
+        if l.0 < grasp::MIN_MARKS && r.0 < grasp::MIN_MARKS {
             warnings.push(format!(
                 "on the path from the present pose only {} and {} marks are visible (at {:.0} % and {:.0} % of it): start closer, or move the rig",
                 l.0,

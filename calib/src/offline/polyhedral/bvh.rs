@@ -1,11 +1,11 @@
-//! A tree of bounding boxes over a mesh: does a box touch it, does a sight line meet it.
+//! A bounding-volume hierarchy over a mesh, for tests of boxes, swept boxes, rays and segments.
 
 use super::mesh::Mesh;
 use crate::files::OrientedBox;
 use graspd_rt::geom::Vec3;
 
-/// Triangles of a leaf.
-const LEAF: usize = 6;
+/// Most triangles of a leaf.
+const MAX_LEAF: usize = 6;
 
 #[derive(Clone, Debug)]
 struct Node {
@@ -17,7 +17,7 @@ struct Node {
     count: u32,
 }
 
-/// The tree.
+/// The hierarchy. Coordinates are those of the mesh frame, metres.
 #[derive(Clone, Debug)]
 pub struct Bvh<'a> {
     mesh: &'a Mesh,
@@ -32,7 +32,7 @@ impl<'a> Bvh<'a> {
         let mut order: Vec<u32> = (0..n as u32).collect();
         let centres: Vec<Vec3> = (0..n).map(|t| mesh.corners(t).iter().sum::<Vec3>() / 3.0).collect();
         let mut tree = Self { mesh, order: Vec::new(), nodes: Vec::with_capacity(n / 2 + 1) };
-        // Depth is at most log2(n) + 1 because each split halves the count; a stack of our own keeps the machine's out of it.
+        // Each split halves the count, so the depth is at most log2(n) + 1. An explicit stack replaces recursion.
         let mut todo = vec![(0usize, n, None::<usize>)];
         while let Some((from, to, parent)) = todo.pop() {
             let id = tree.nodes.len();
@@ -47,7 +47,7 @@ impl<'a> Bvh<'a> {
                     hi = hi.sup(&v);
                 }
             }
-            if slice.len() <= LEAF {
+            if slice.len() <= MAX_LEAF {
                 tree.nodes.push(Node { lo, hi, start: from as u32, count: slice.len() as u32 });
                 continue;
             }
@@ -64,6 +64,8 @@ impl<'a> Bvh<'a> {
         tree
     }
 
+    /// Calls `hit` with the triangles of all leaves whose ancestors' boxes satisfy `meets`, until it returns true.
+    /// Returns whether it did.
     fn walk(&self, meets: &dyn Fn(&Vec3, &Vec3) -> bool, hit: &mut dyn FnMut(usize) -> bool) -> bool {
         let mut todo = vec![0usize];
         while let Some(k) = todo.pop() {
@@ -86,25 +88,26 @@ impl<'a> Bvh<'a> {
         false
     }
 
-    /// Whether a box (in the mesh's frame) touches any triangle.
+    /// Whether a box touches any triangle.
     pub fn touches(&self, b: &OrientedBox) -> bool {
         self.touches_sweep(b, &Vec3::zeros())
     }
 
-    /// Whether a box touches any triangle anywhere on its straight way from where it stands to `way` (metres, mesh's frame) from there.
+    /// Whether a box touches any triangle during a straight motion by `travel` from its position.
     ///
-    /// Exact however the box is turned against its way: what it sweeps is a convex body with known axes, not a row of samples.
-    pub fn touches_sweep(&self, b: &OrientedBox, way: &Vec3) -> bool {
+    /// Exact for any orientation of the box: the swept volume is a convex body with known separating axes, not a series
+    /// of samples.
+    pub fn touches_sweep(&self, b: &OrientedBox, travel: &Vec3) -> bool {
         let r = b.frame_from_box.rotation.to_rotation_matrix();
         let mut body = Zonotope {
-            centre: b.frame_from_box.translation.vector + way * 0.5,
+            centre: b.frame_from_box.translation.vector + travel * 0.5,
             half: [Vec3::zeros(); 4],
             axes: Vec::new(),
         };
         for (k, h) in body.half.iter_mut().take(3).enumerate() {
             *h = r.matrix().column(k) * b.half[k];
         }
-        body.half[3] = way * 0.5;
+        body.half[3] = travel * 0.5;
         body.find_axes();
         let reach = body.half.iter().fold(Vec3::zeros(), |a, h| a + h.abs());
         let (lo, hi) = (body.centre - reach, body.centre + reach);
@@ -114,7 +117,7 @@ impl<'a> Bvh<'a> {
         self.walk(&meets, &mut |t| body.touches(&self.mesh.corners(t)))
     }
 
-    /// Calls `found` with every triangle whose bounding box comes within `radius` (metres) of a point.
+    /// Calls `found` with every triangle whose bounding box is within `radius` (in each coordinate) of a point.
     pub fn near(&self, p: &Vec3, radius: f64, mut found: impl FnMut(u32)) {
         let meets = |l: &Vec3, h: &Vec3| (0..3).all(|k| l[k] <= p[k] + radius && h[k] >= p[k] - radius);
         self.walk(&meets, &mut |t| {
@@ -126,14 +129,15 @@ impl<'a> Bvh<'a> {
         });
     }
 
-    /// Whether a point lies in the solid. Rays in several directions vote by the side from which they meet the surface first, so that a hole in
-    /// it or a few wrong windings do not decide.
+    /// Whether a point is inside the solid. Rays in several directions vote by the side from which they first hit the
+    /// surface, so that a hole or a few wrongly oriented triangles do not decide.
     pub fn encloses(&self, p: &Vec3) -> bool {
         let inside = RAYS.iter().filter(|d| self.first_hit(p, &Vec3::from(**d)).is_some_and(|leaves| leaves)).count();
         2 * inside > RAYS.len() + 1
     }
 
-    /// Whether a point is told to be inside by how often rays from it meet those triangles of a closed surface that `counts`.
+    /// Whether a point is inside the closed surface of the triangles that `counts` selects, by the parity of ray
+    /// crossings.
     pub fn odd(&self, p: &Vec3, counts: impl Fn(u32) -> bool) -> bool {
         let odd = |d: &[f64; 3]| {
             let mut n = 0;
@@ -143,7 +147,7 @@ impl<'a> Bvh<'a> {
         RAYS.iter().take(3).filter(|d| odd(d)).count() > 1
     }
 
-    /// Every triangle that a ray meets.
+    /// All triangles that a ray crosses, ascending.
     pub fn pierced(&self, p: &Vec3, direction: &Vec3) -> Vec<u32> {
         let mut out = Vec::new();
         self.ray(p, direction, |t, _, _| out.push(t));
@@ -151,7 +155,7 @@ impl<'a> Bvh<'a> {
         out
     }
 
-    /// Whether the first triangle that a ray meets is met from its inner side; `None` when there is none.
+    /// Whether a ray hits its first triangle from the inner side; `None` if it hits none.
     fn first_hit(&self, p: &Vec3, direction: &Vec3) -> Option<bool> {
         let mut first: Option<(f64, bool)> = None;
         self.ray(p, direction, |_, at, leaves| {
@@ -162,7 +166,8 @@ impl<'a> Bvh<'a> {
         first.map(|f| f.1)
     }
 
-    /// Calls `hit` with the triangle and the distance of every crossing of a ray and whether it leaves the solid there by the triangle's normal.
+    /// Calls `hit` for every crossing of a ray, with the triangle, the distance in lengths of `d`, and whether the ray
+    /// leaves the solid there according to the triangle's normal.
     fn ray(&self, p: &Vec3, d: &Vec3, mut hit: impl FnMut(u32, f64, bool)) {
         let inverse = d.map(|x| 1.0 / x);
         let meets = |lo: &Vec3, hi: &Vec3| {
@@ -182,7 +187,7 @@ impl<'a> Bvh<'a> {
         });
     }
 
-    /// Whether the segment from `a` to `b` meets the mesh, away from its ends by `skin` (metres).
+    /// Whether the segment from `a` to `b`, shortened by `skin` (metres) at each end, crosses the mesh.
     pub fn meets_segment(&self, a: &Vec3, b: &Vec3, skin: f64) -> bool {
         let d = b - a;
         let length = d.norm();
@@ -210,7 +215,8 @@ impl<'a> Bvh<'a> {
     }
 }
 
-/// Directions of the rays that vote on inside and outside: none of them along an axis, where a part's own faces and edges lie.
+/// Directions of the rays that vote on inside and outside. None is parallel to an axis: faces and edges of parts often
+/// are.
 const RAYS: [[f64; 3]; 7] = [
     [0.5773, 0.5431, 0.6092],
     [-0.8137, 0.3391, 0.4724],
@@ -221,12 +227,14 @@ const RAYS: [[f64; 3]; 7] = [
     [0.7411, -0.4337, -0.5129],
 ];
 
-/// Where the line `p + s d` crosses a triangle: `s`, and the determinant, negative where it goes along the normal.
+/// The crossing of the line `p + s d` with a triangle: `s`, and the determinant, which is negative if `d` points along
+/// the normal.
 fn crossing(p: &Vec3, d: &Vec3, [a, b, c]: &[Vec3; 3]) -> Option<(f64, f64)> {
     let (e1, e2) = (b - a, c - a);
     let h = d.cross(&e2);
     let det = e1.dot(&h);
-    // Relative to the lengths that enter it: a small triangle of a fine scan is no line.
+    // Relative to the lengths that enter the determinant, so that the small triangles of a fine scan are not
+    // degenerate.
     if det.abs() < 1e-12 * e1.norm() * e2.norm() * d.norm() {
         return None;
     }
@@ -237,11 +245,11 @@ fn crossing(p: &Vec3, d: &Vec3, [a, b, c]: &[Vec3; 3]) -> Option<(f64, f64)> {
     (u >= 0.0 && v >= 0.0 && u + v <= 1.0).then(|| (e2.dot(&w) / det, det))
 }
 
-/// A box drawn out along a line: all points `centre + sum of k_i half_i` with `k_i` from -1 to 1.
+/// A box swept along a line: all points `centre + sum of k_i half_i` with `k_i` from -1 to 1.
 struct Zonotope {
     centre: Vec3,
     half: [Vec3; 4],
-    /// Normals of its faces.
+    /// Unit normals of its faces.
     axes: Vec<Vec3>,
 }
 
@@ -249,35 +257,38 @@ impl Zonotope {
     fn find_axes(&mut self) {
         for (i, a) in self.half.iter().enumerate() {
             for b in self.half.iter().skip(i + 1) {
-                // Sides along each other span no face.
+                // Parallel edges span no face.
                 self.axes.extend(a.cross(b).try_normalize(1e-18));
             }
         }
     }
 
+    /// Half of its extent along an axis.
     fn reach(&self, axis: &Vec3) -> f64 {
         self.half.iter().map(|h| h.dot(axis).abs()).sum()
     }
 
-    /// Whether one of its faces separates it from an axis-parallel box; a hint, which may say "meets" too often.
+    /// Whether no face of it separates it from an axis-parallel box: a conservative test that may return true for a box
+    /// that it does not meet.
     fn meets_box(&self, centre: &Vec3, half: &Vec3) -> bool {
         let d = centre - self.centre;
         self.axes.iter().all(|a| d.dot(a).abs() <= self.reach(a) + half.dot(&a.abs()))
     }
 
-    /// Separating axes of two convex bodies: they touch when none of their faces' normals and of the products of their edges separates them.
+    /// Separating-axis test: two convex bodies touch if none of the face normals and edge cross products separates
+    /// them.
     fn touches(&self, t: &[Vec3; 3]) -> bool {
         let t = t.map(|v| v - self.centre);
-        let apart = |axis: &Vec3| {
+        let separates = |axis: &Vec3| {
             let p = t.map(|v| v.dot(axis));
             let reach = self.reach(axis);
             let (lo, hi) = (p[0].min(p[1]).min(p[2]), p[0].max(p[1]).max(p[2]));
             lo > reach || hi < -reach
         };
         let edges = [t[1] - t[0], t[2] - t[1], t[0] - t[2]];
-        !(self.axes.iter().any(apart)
-            || apart(&edges[0].cross(&edges[1]))
-            || self.half.iter().any(|h| edges.iter().any(|e| apart(&h.cross(e)))))
+        !(self.axes.iter().any(separates)
+            || separates(&edges[0].cross(&edges[1]))
+            || self.half.iter().any(|h| edges.iter().any(|e| separates(&h.cross(e)))))
     }
 }
 
@@ -288,7 +299,7 @@ mod tests {
     use nalgebra::Point3;
     use rand::{RngExt, SeedableRng};
 
-    /// Whether a triangle reaches into a box, by cutting it off at the box's six sides.
+    /// Whether a triangle intersects a box, by clipping the triangle at the six sides of the box.
     fn clip(b: &OrientedBox, t: &[Vec3; 3]) -> bool {
         let inverse = b.frame_from_box.inverse();
         let mut p: Vec<Vec3> = t.iter().map(|v| (inverse * Point3::from(*v)).coords).collect();
@@ -310,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn the_tree_answers_as_a_plain_search_does() {
+    fn the_tree_agrees_with_a_plain_search() {
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(5);
         let mut v = |s: f64| Vec3::from_fn(|_, _| rng.random_range(-s..s));
         let corners: Vec<[Vec3; 3]> = (0..400)
@@ -327,16 +338,16 @@ mod tests {
             let b = OrientedBox { frame_from_box: pose, half: v(0.15).abs() + Vec3::repeat(0.01) };
             let plain = (0..mesh.triangles.len()).any(|t| clip(&b, &mesh.corners(t)));
             assert_eq!(tree.touches(&b), plain, "{k}");
-            // A sweep touches what any of many boxes on the way touches, and only a little more than they do.
-            let way = v(0.3);
+            // A sweep touches what any of many boxes along it touches, and what slightly larger boxes touch at most.
+            let travel = v(0.3);
             let boxes = |n: usize, grow: f64| {
                 (0..=n).any(|i| {
                     let on = OrientedBox { half: b.half + Vec3::repeat(grow), ..b }
-                        .moved(&Pose::from(way * (i as f64 / n as f64)));
+                        .moved(&Pose::from(travel * (i as f64 / n as f64)));
                     tree.touches(&on)
                 })
             };
-            let swept = tree.touches_sweep(&b, &way);
+            let swept = tree.touches_sweep(&b, &travel);
             assert!(swept || !boxes(60, 0.0), "{k}");
             assert!(!swept || boxes(60, 5e-3), "{k}");
             touched += i32::from(plain);
@@ -352,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn a_box_that_holds_a_triangle_or_is_pierced_by_one_touches_it() {
+    fn a_box_touches_a_triangle_inside_it_and_one_through_it() {
         let big = [Vec3::new(-9.0, -9.0, 0.1), Vec3::new(9.0, -9.0, 0.1), Vec3::new(0.0, 9.0, 0.1)];
         let half = Vec3::new(1.0, 1.0, 0.2);
         let touches = |t: [Vec3; 3]| {

@@ -1,18 +1,18 @@
-//! The flat faces of a mesh: regions of triangles in nearly one plane, whether a CAD part's exact ones or a scan's noisy ones.
+//! The flat faces of a mesh: regions of triangles in nearly one plane, of exact CAD models and of noisy scans.
 
 use super::bvh::Bvh;
 use super::links::Links;
 use super::mesh::Mesh;
-use super::smooth::{crumpled, noise, relaxed, smoothed};
+use super::smooth::{is_noisy, noise, relaxed, smoothed};
 use graspd_rt::geom::Vec3;
 use std::collections::VecDeque;
 
-/// What counts as flat.
+/// Limits of a flat face.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Flatness {
-    /// Largest angle of a triangle against its face, radians.
+    /// Largest angle between a triangle and its face, radians.
     pub angle: f64,
-    /// Largest distance from the face's plane, metres. A scan whose noise is larger gets more.
+    /// Largest distance of a triangle from the plane of its face, metres. It is raised for a scan with larger noise.
     pub distance: f64,
     /// Smallest area of a face, square metres.
     pub area: f64,
@@ -33,32 +33,35 @@ pub struct Face {
     pub centre: Vec3,
     /// Area, square metres.
     pub area: f64,
-    /// Its triangles, ascending.
+    /// Indices of its triangles, ascending.
     pub triangles: Vec<u32>,
 }
 
-/// Two faces whose planes differ by less than this are one that was found in two pieces: 3 degrees.
-const SAME_PLANE: f64 = 0.9986;
-/// A triangle beside a face belongs to it when it lies in its plane and faces its side: cosine of 50 degrees, for the crumples of a scan.
-const SAME_SIDE: f64 = 0.643;
-/// The angle within which two faces are partners already: 6 degrees, as for a handle.
-const PARTNER: f64 = 0.9945;
-/// A region may not reach further from its plane than this, however noisy, metres.
-const MOST_DISTANCE: f64 = 1e-3;
+/// Smallest cosine between the normals of two adjacent regions that are one face found in two pieces: 3 degrees.
+const MIN_COS_SAME_PLANE: f64 = 0.9986;
+/// Smallest cosine between a face's normal and that of a triangle in its plane that belongs to it: 50 degrees, because
+/// the normals of a scan are noisy.
+const MIN_COS_SAME_SIDE: f64 = 0.643;
+/// Smallest cosine between the normal of a face and the reversed normal of its partner: 6 degrees, as for a handle.
+const MIN_COS_PARTNER: f64 = 0.9945;
+/// Upper limit of [`Flatness::distance`] for noisy scans, metres.
+const MAX_DISTANCE_M: f64 = 1e-3;
 
-/// Triangles with all that growing asks for.
+/// The triangles of a mesh with the data for region growing. Vectors are indexed by triangle.
 struct Ground {
     links: Links,
-    /// Normals with the scan's noise taken out.
+    /// Unit normals, smoothed for scans.
     normal: Vec<Vec3>,
-    /// Half the cross product of two sides: area times the triangle's own normal.
+    /// Area times unit normal, not smoothed.
     vector: Vec<Vec3>,
     centre: Vec<Vec3>,
-    /// Needles, whose own normal is only rounding error.
+    /// Whether the triangle is a needle, whose normal is only rounding error.
     needle: Vec<bool>,
-    /// Whether noise is larger than the mesh's creases: a scan.
-    crumpled: bool,
+    /// Whether the mesh is a scan, with noise larger than its creases.
+    noisy: bool,
+    /// Largest distance from the plane of a face, metres.
     distance: f64,
+    /// Smallest cosine between a triangle and its face.
     cos: f64,
 }
 
@@ -66,11 +69,11 @@ fn get<T: Copy + Default>(v: &[T], t: u32) -> T {
     v.get(t as usize).copied().unwrap_or_default()
 }
 
-/// Finds the faces of a mesh, the largest first. `tree` is of the same mesh.
+/// Finds the faces of a mesh, largest first. `tree` is the hierarchy of the same mesh.
 pub fn faces(mesh: &Mesh, tree: &Bvh<'_>, flat: &Flatness) -> Vec<Face> {
     let g = Ground::new(mesh, tree, flat);
     let n = mesh.triangles.len() as u32;
-    // The face of each triangle, counted from 1.
+    // The face of each triangle, counted from 1; 0 for none.
     let mut owner = vec![0u32; n as usize];
     let mut regions: Vec<Vec<u32>> = Vec::new();
     let mut barren = g.needle.clone();
@@ -79,14 +82,15 @@ pub fn faces(mesh: &Mesh, tree: &Bvh<'_>, flat: &Flatness) -> Vec<Face> {
         if get(&owner, seed) != 0 || get(&barren, seed) {
             continue;
         }
-        let grown = g.grow(seed, &owner, &mut stamp, k as u32 + 1);
+        let grown = g.grow(seed, &owner, &mut stamp, k as u32 + 1, None);
         let area: f64 = grown.iter().map(|t| get(&g.vector, *t).norm()).sum();
         if area >= flat.area {
             regions.push(Vec::new());
-            own(&mut owner, &grown, regions.len() as u32);
+            assign(&mut owner, &grown, regions.len() as u32);
             continue;
         }
-        // Small regions stay free: a larger one, seeded later, may reach them. Seeds beside this one would only find the same again.
+        // The triangles of a small region stay free for a larger one with a later seed. Seeds near this one would give
+        // the same region again.
         let from = get(&g.centre, seed);
         let near = 0.09 * area / std::f64::consts::PI;
         for t in &grown {
@@ -104,7 +108,7 @@ pub fn faces(mesh: &Mesh, tree: &Bvh<'_>, flat: &Flatness) -> Vec<Face> {
     }
     let mut found: Vec<Face> = regions.into_iter().filter_map(|r| g.face(r)).collect();
     found = g.merge(found, &mut owner);
-    if g.crumpled {
+    if g.noisy {
         found = g.complete(mesh, found);
     }
     found.sort_by(|a, b| b.area.total_cmp(&a.area));
@@ -113,7 +117,8 @@ pub fn faces(mesh: &Mesh, tree: &Bvh<'_>, flat: &Flatness) -> Vec<Face> {
     found
 }
 
-fn own(owner: &mut [u32], triangles: &[u32], face: u32) {
+/// Assigns triangles to a face.
+fn assign(owner: &mut [u32], triangles: &[u32], face: u32) {
     for t in triangles {
         if let Some(o) = owner.get_mut(*t as usize) {
             *o = face;
@@ -141,16 +146,17 @@ impl Ground {
         };
         let noise = noise(mesh);
         let (mut vector, mut centre, needle) = measure(mesh);
-        let crumpled = crumpled(&links, &vector, &needle);
-        if crumpled {
+        let noisy = is_noisy(&links, &vector, &needle);
+        if noisy {
             (vector, centre, _) = measure(&relaxed(mesh, noise));
         }
-        let normal = smoothed(&links, &vector, &needle, crumpled);
-        let distance = flat.distance.max((3.5 * noise).min(MOST_DISTANCE));
-        Self { links, normal, vector, centre, needle, crumpled, distance, cos: flat.angle.cos() }
+        let normal = smoothed(&links, &vector, &needle, noisy);
+        let distance = flat.distance.max((3.5 * noise).min(MAX_DISTANCE_M));
+        Self { links, normal, vector, centre, needle, noisy, distance, cos: flat.angle.cos() }
     }
 
-    /// Where to begin: in flat surroundings, because a seed on a rounded edge would take a slice off two faces; large triangles before small.
+    /// Seeds in the order in which they are tried: flat neighbourhoods first, because a seed on a rounded edge would
+    /// take triangles from two faces; then large triangles before small ones.
     fn seeds(&self) -> Vec<u32> {
         let n = self.normal.len() as u32;
         let rough = |t: u32| {
@@ -164,12 +170,10 @@ impl Ground {
         seeds.into_iter().map(|s| s.2).collect()
     }
 
-    fn grow(&self, seed: u32, owner: &[u32], stamp: &mut [u32], mark: u32) -> Vec<u32> {
-        self.spread(seed, owner, stamp, mark, None)
-    }
-
-    /// The region round a seed, in the plane of a given normal or, without one, in the plane that it turns out to have.
-    fn spread(&self, seed: u32, owner: &[u32], stamp: &mut [u32], mark: u32, fixed: Option<Vec3>) -> Vec<u32> {
+    /// Grows a region from a seed over triangles without an owner. The normal of its plane is `fixed`, or the mean
+    /// normal of the region. `stamp` holds the number of the last region that reached each triangle; `mark` is that of
+    /// this one.
+    fn grow(&self, seed: u32, owner: &[u32], stamp: &mut [u32], mark: u32, fixed: Option<Vec3>) -> Vec<u32> {
         let (mut plane_n, mut plane_c) = (fixed.unwrap_or(get(&self.normal, seed)), get(&self.centre, seed));
         let (mut sum_n, mut sum_c, mut sum_a) = (Vec3::zeros(), Vec3::zeros(), 0.0);
         let mut queue = VecDeque::from([seed]);
@@ -183,7 +187,8 @@ impl Ground {
             sum_n += get(&self.normal, t) * a;
             sum_c += get(&self.centre, t) * a;
             sum_a += a;
-            // The plane follows the region while it is young, then stands: a slowly turning surface must not lead it round.
+            // The plane follows the region while it is small, then stays: otherwise the region follows a curved
+            // surface.
             if fixed.is_none() && out.len().is_power_of_two() && out.len() <= 4096 {
                 if let Some(n) = sum_n.try_normalize(1e-300) {
                     plane_n = n;
@@ -209,7 +214,8 @@ impl Ground {
         out
     }
 
-    /// The face that triangles make up. The sum of their area vectors depends only on their common outline, so that a scan's noise cancels.
+    /// The face of a set of triangles. The sum of their area vectors depends on their common outline only, so that the
+    /// noise of a scan cancels.
     fn face(&self, mut triangles: Vec<u32>) -> Option<Face> {
         triangles.sort_unstable();
         let (mut sum_n, mut sum_c, mut sum_a) = (Vec3::zeros(), Vec3::zeros(), 0.0);
@@ -223,10 +229,10 @@ impl Ground {
         Some(Face { normal, centre: sum_c / sum_a, area: sum_a, triangles })
     }
 
-    /// Makes one of neighbours that lie in one plane: a face may be found in pieces where it is crumpled or cut by needles.
+    /// Merges adjacent faces in one plane: noise and needles may split a face into pieces.
     fn merge(&self, found: Vec<Face>, owner: &mut [u32]) -> Vec<Face> {
         for (k, f) in found.iter().enumerate() {
-            own(owner, &f.triangles, k as u32 + 1);
+            assign(owner, &f.triangles, k as u32 + 1);
         }
         let mut root: Vec<usize> = (0..found.len()).collect();
         let top = |root: &[usize], mut k: usize| {
@@ -236,7 +242,7 @@ impl Ground {
             k
         };
         for (k, f) in found.iter().enumerate() {
-            let mut beside: Vec<usize> = f
+            let mut adjacent: Vec<usize> = f
                 .triangles
                 .iter()
                 .flat_map(|t| self.links.of(*t))
@@ -244,13 +250,13 @@ impl Ground {
                 .filter(|o| *o > k + 1)
                 .map(|o| o - 1)
                 .collect();
-            beside.sort_unstable();
-            beside.dedup();
-            for other in beside {
+            adjacent.sort_unstable();
+            adjacent.dedup();
+            for other in adjacent {
                 let Some(g) = found.get(other) else { continue };
                 let d = g.centre - f.centre;
                 let off = d.dot(&f.normal).abs().max(d.dot(&g.normal).abs());
-                if f.normal.dot(&g.normal) >= SAME_PLANE && off <= self.distance {
+                if f.normal.dot(&g.normal) >= MIN_COS_SAME_PLANE && off <= self.distance {
                     let (a, b) = (top(&root, k), top(&root, other));
                     if let Some(r) = root.get_mut(a.max(b)) {
                         *r = a.min(b);
@@ -267,31 +273,31 @@ impl Ground {
         groups.into_iter().filter(|g| !g.is_empty()).filter_map(|g| self.face(g)).collect()
     }
 
-    /// Round walls are cut into strips where growing happened to begin, on one side not where on the other. For each strip whose opposite is not
-    /// its partner already, the strip that is.
+    /// Curved walls are split into strips that depend on the seeds, so the strips of two opposite walls do not match.
+    /// For each face without a partner (an opposed face behind its centre), grows that partner.
     fn partners(&self, tree: &Bvh<'_>, found: &[Face], flat: &Flatness) -> Vec<Face> {
         let mut out: Vec<Face> = Vec::new();
         let mut stamp = vec![0u32; self.normal.len()];
         let none = stamp.clone();
         let mut mark = 0;
-        let opposed = |f: &Face, n: &Vec3| f.normal.dot(n) <= -PARTNER;
+        let opposed = |f: &Face, n: &Vec3| f.normal.dot(n) <= -MIN_COS_PARTNER;
         for f in found {
-            // The triangle nearest to the middle: the middle itself may be in the air.
+            // The triangle nearest to the centre: the centre itself need not be on the face.
             let off = |t: &u32| (get(&self.centre, *t) - f.centre).norm_squared();
             let Some(middle) = f.triangles.iter().min_by(|a, b| off(a).total_cmp(&off(b))) else { continue };
             let hits = tree.pierced(&get(&self.centre, *middle), &-f.normal);
             for hit in hits.into_iter().filter(|t| t != middle && get(&self.normal, *t).dot(&f.normal) <= -self.cos) {
-                // It is found when the strip holds the triangle hit, or stands beside it.
+                // A partner exists if an opposed face contains the hit triangle, or is near it in the same plane.
                 let known = |g: &Face| {
                     let d = get(&self.centre, hit) - g.centre;
-                    let beside = d.dot(&g.normal).abs() <= self.distance && d.norm_squared() <= g.area;
-                    opposed(f, &g.normal) && (beside || g.triangles.binary_search(&hit).is_ok())
+                    let near = d.dot(&g.normal).abs() <= self.distance && d.norm_squared() <= g.area;
+                    opposed(f, &g.normal) && (near || g.triangles.binary_search(&hit).is_ok())
                 };
                 if found.iter().chain(&out).any(known) {
                     continue;
                 }
                 mark += 1;
-                let grown = self.spread(hit, &none, &mut stamp, mark, Some(-f.normal));
+                let grown = self.grow(hit, &none, &mut stamp, mark, Some(-f.normal));
                 if let Some(g) = self.face(grown).filter(|g| g.area >= flat.area && opposed(f, &g.normal)) {
                     out.push(g);
                 }
@@ -300,12 +306,13 @@ impl Ground {
         out
     }
 
-    /// Gives to a scan's faces every triangle that lies in their plane and holds together with them, however it is turned: near an edge and in a
-    /// crumple the normals say little. A triangle may so belong to two faces that meet. Faces that come out again are left out.
+    /// Adds to the faces of a scan all connected triangles in their planes, for any normal: near edges and in noise a
+    /// normal means little. A triangle may then belong to two adjacent faces. Faces found twice are left out.
     fn complete(&self, mesh: &Mesh, mut found: Vec<Face>) -> Vec<Face> {
         found.sort_by(|a, b| b.area.total_cmp(&a.area));
         let n = mesh.triangles.len();
-        // The last face that reached each triangle, counted from 1, and the one of them that holds it for its own.
+        // For each triangle, the last face that reached it, counted from 1, and the last one whose normal it agrees
+        // with.
         let (mut reached, mut held) = (vec![0u32; n], vec![0u32; n]);
         let mut out: Vec<Face> = Vec::new();
         for f in found {
@@ -316,23 +323,23 @@ impl Ground {
             if 2 * again.count() > f.triangles.len() {
                 continue;
             }
-            // The plane by the scan itself, not by its relaxed shape.
+            // The plane of the scan itself, not of its relaxed shape.
             let mark = out.len() as u32 + 1;
             let corners = |t: u32| mesh.corners(t as usize);
             let count = (3 * f.triangles.len().max(1)) as f64;
             let centre = f.triangles.iter().flat_map(|t| corners(*t)).sum::<Vec3>() / count;
             let flat = |t: u32| corners(t).iter().all(|p| (p - centre).dot(&f.normal).abs() <= self.distance);
             let mut queue = f.triangles.clone();
-            own(&mut reached, &queue, mark);
-            own(&mut held, &queue, mark);
+            assign(&mut reached, &queue, mark);
+            assign(&mut held, &queue, mark);
             let mut next = 0;
             while let Some(t) = queue.get(next).copied() {
                 next += 1;
                 for k in self.links.of(t) {
                     if get(&reached, *k) != mark && flat(*k) {
-                        own(&mut reached, &[*k], mark);
-                        if get(&self.normal, *k).dot(&f.normal) > SAME_SIDE {
-                            own(&mut held, &[*k], mark);
+                        assign(&mut reached, &[*k], mark);
+                        if get(&self.normal, *k).dot(&f.normal) > MIN_COS_SAME_SIDE {
+                            assign(&mut held, &[*k], mark);
                         }
                         queue.push(*k);
                     }

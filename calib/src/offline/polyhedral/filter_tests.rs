@@ -1,9 +1,9 @@
-//! Handles of parts whose handles can be counted by hand, held against a collision check of its own.
+//! Parts whose handles can be counted by hand, checked with an independent collision test.
 
 use super::super::faces::{Flatness, faces};
 use super::super::handles::{Opposition, enumerate};
 use super::super::mesh::Mesh;
-use super::super::place::collision;
+use super::super::placement::collision;
 use super::*;
 use crate::files::OrientedBox;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
@@ -19,7 +19,7 @@ fn block(lo: [f64; 3], hi: [f64; 3]) -> Vec<[Vec3; 3]> {
 fn prism(n: usize, radius: f64, hole: Option<f64>, height: f64) -> Vec<[Vec3; 3]> {
     let m = 6 * n;
     let outer = |k: usize, z: f64| {
-        // Points along the sides of the polygon, so that the hole can follow.
+        // Points along the sides of the polygon, to which the points of the hole correspond.
         let (side, part) = (k / 6 % n, (k % 6) as f64 / 6.0);
         let corner = |s: usize| {
             let a = s as f64 * std::f64::consts::TAU / n as f64;
@@ -65,11 +65,11 @@ fn gripper(max: f64, finger: f64) -> GripperFile {
     GripperFile::parse(&text, "gripper").unwrap()
 }
 
-fn judged(corners: Vec<[Vec3; 3]>, g: &GripperFile) -> Vec<Judged> {
+fn assessed(corners: Vec<[Vec3; 3]>, g: &GripperFile) -> Vec<Assessed> {
     let mesh = Mesh::from_corners(corners).unwrap();
     let tree = Bvh::new(&mesh);
     let found = enumerate(&mesh, &faces(&mesh, &tree, &Flatness::default()), &Opposition::default());
-    let s = Situation {
+    let s = Constraints {
         rig: None,
         left_from_mesh: Pose::identity(),
         clearance: 1e-3,
@@ -79,10 +79,10 @@ fn judged(corners: Vec<[Vec3; 3]>, g: &GripperFile) -> Vec<Judged> {
         present: None,
         max_turn: None,
     };
-    let all = judge(&found, &tree, g, &s);
+    let all = assess(&found, &tree, g, &s);
     for j in all.iter().filter(|j| j.reason.is_none()) {
         for b in g.boxes(j.opening) {
-            // A scan has points enough for a few positions to do.
+            // A scan has so many points that a few positions suffice.
             let every = if mesh.triangles.len() > 10_000 { 12 } else { 1 };
             for k in (0..=25).step_by(every) {
                 let back = Pose::translation(0.0, 0.0, -0.05 * f64::from(k) / 25.0);
@@ -95,7 +95,8 @@ fn judged(corners: Vec<[Vec3; 3]>, g: &GripperFile) -> Vec<Judged> {
     all
 }
 
-/// Whether a box collides with a mesh, told without the tree: no sample of the surface lies in the box, and no sample of the box in the solid.
+/// Whether a box collides with a mesh, without the hierarchy: a sample of the surface is inside the box, or a sample of
+/// the box is inside the solid.
 fn sampled_collision(mesh: &Mesh, b: &OrientedBox, seed: i32) -> bool {
     use rand::{RngExt, SeedableRng};
     let inverse = b.frame_from_box.inverse();
@@ -116,20 +117,20 @@ fn sampled_collision(mesh: &Mesh, b: &OrientedBox, seed: i32) -> bool {
             }
         }
     }
-    // Parity of a ray's crossings, over every triangle; a mesh of many is left to the surface's own samples.
+    // Parity of the ray crossings over all triangles; omitted for large meshes, whose surface samples suffice.
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed as u64);
-    let way = Vec3::new(0.3713, 0.7219, 0.5837);
+    let ray = Vec3::new(0.3713, 0.7219, 0.5837);
     let crossings = |p: &Vec3| {
         (0..mesh.triangles.len())
             .filter(|t| {
                 let [a, e, c] = mesh.corners(*t);
                 let (u, v) = (e - a, c - a);
-                let h = way.cross(&v);
+                let h = ray.cross(&v);
                 let det = u.dot(&h);
                 let s = p - a;
                 let x = s.dot(&h) / det;
                 let q = s.cross(&u);
-                let y = way.dot(&q) / det;
+                let y = ray.dot(&q) / det;
                 det.abs() > 1e-18 && x >= 0.0 && y >= 0.0 && x + y <= 1.0 && v.dot(&q) / det > 0.0
             })
             .count()
@@ -141,11 +142,12 @@ fn sampled_collision(mesh: &Mesh, b: &OrientedBox, seed: i32) -> bool {
         })
 }
 
-/// Looks at every place of the dropped handles, half a millimetre apart: where one is free, the handle was dropped wrongly.
-fn nothing_missed(found: &Handles, tree: &Bvh<'_>, g: &GripperFile, s: &Situation<'_>, all: &[Judged]) {
+/// Tests placements of the dropped handles on a grid of half a millimetre: if one is free, the handle was dropped
+/// wrongly.
+fn nothing_missed(found: &Handles, tree: &Bvh<'_>, g: &GripperFile, s: &Constraints<'_>, all: &[Assessed]) {
     let claw = &g.fingers[0].closed;
     let (half, beyond) = (claw.half.y, claw.frame_from_box.translation.z + claw.half.z);
-    for j in all.iter().filter(|j| matches!(j.reason, Some(Reason::Collides { .. } | Reason::Contact { .. }))) {
+    for j in all.iter().filter(|j| matches!(j.reason, Some(Rejection::Collides { .. } | Rejection::Contact { .. }))) {
         let o = &found.overlaps[j.handle.overlap];
         let y = j.handle.approach.cross(&j.handle.closing);
         let axes = Matrix3::from_columns(&[j.handle.closing, y, j.handle.approach]);
@@ -160,7 +162,7 @@ fn nothing_missed(found: &Handles, tree: &Bvh<'_>, g: &GripperFile, s: &Situatio
             for k in 1..=steps(depth) {
                 let (at, tip) = (side.0 + 0.5e-3 * f64::from(i), depth.0 + 0.5e-3 * f64::from(k));
                 let strip = cells.iter().filter(|c| (c.0 - at).abs() <= half && c.1 <= tip);
-                // With a margin for the steps and the raster: a place that barely serves may be passed over.
+                // With a margin for the steps and the raster: a placement with barely enough contact may be missed.
                 if (strip.count() as f64) * o.cell * o.cell < 1.3 * s.contact {
                     continue;
                 }
@@ -176,51 +178,54 @@ fn nothing_missed(found: &Handles, tree: &Bvh<'_>, g: &GripperFile, s: &Situatio
     }
 }
 
-fn kept(all: &[Judged]) -> usize {
+fn kept(all: &[Assessed]) -> usize {
     all.iter().filter(|j| j.reason.is_none()).count()
 }
 
 #[test]
-fn a_cube_has_three_pairs_with_four_ways_in() {
+fn a_cube_has_three_pairs_with_four_approaches() {
     let cube = || block([-0.02; 3], [0.02; 3]);
-    assert_eq!(kept(&judged(cube(), &gripper(0.06, 0.05))), 12);
-    let narrow = judged(cube(), &gripper(0.03, 0.05));
+    assert_eq!(kept(&assessed(cube(), &gripper(0.06, 0.05))), 12);
+    let narrow = assessed(cube(), &gripper(0.03, 0.05));
     assert_eq!((kept(&narrow), narrow.len()), (0, 12));
-    assert!(narrow.iter().all(|j| matches!(j.reason, Some(Reason::TooWide { .. }))));
+    assert!(narrow.iter().all(|j| matches!(j.reason, Some(Rejection::TooWide { .. }))));
 }
 
 #[test]
 fn a_hexagonal_nut_has_three_pairs_of_flats_and_its_two_ends() {
-    // 30 mm across corners, 12 mm high: three pairs of flats with four ways in; the ends with six.
-    let all = judged(prism(6, 0.015, Some(0.006), 0.012), &gripper(0.06, 0.05));
+    // 30 mm across corners, 12 mm high: three pairs of flats with four approaches, and the ends with six.
+    let all = assessed(prism(6, 0.015, Some(0.006), 0.012), &gripper(0.06, 0.05));
     let flats = all.iter().filter(|j| (j.handle.width - 0.015 * 3f64.sqrt()).abs() < 1e-4).count();
     let ends = all.iter().filter(|j| (j.handle.width - 0.012).abs() < 1e-4).count();
     assert_eq!((flats, ends, kept(&all)), (12, 6, 18));
-    // Each flat also stands opposite a piece of the hole's wall, but the hole is too narrow for a claw.
-    let walls: Vec<&Judged> = all.iter().filter(|j| j.handle.width < 0.0085).collect();
+    // Each flat is also opposed to a piece of the hole's wall, but the hole is too narrow for a claw.
+    let walls: Vec<&Assessed> = all.iter().filter(|j| j.handle.width < 0.0085).collect();
     assert_eq!(walls.len(), 24);
     assert!(
-        walls.iter().all(|j| matches!(j.reason, Some(Reason::Collides { what: "fingers" } | Reason::Contact { .. })))
+        walls
+            .iter()
+            .all(|j| matches!(j.reason, Some(Rejection::Collides { what: "fingers" } | Rejection::Contact { .. })))
     );
 }
 
 #[test]
 fn a_stepped_block_keeps_what_the_step_leaves_free() {
-    // A wide foot with a narrow ridge: from above the ridge can be taken; along its own faces from below it cannot.
+    // A wide foot with a narrow ridge: the ridge can be taken from above, but not from below.
     let mut part = block([-0.05, -0.02, 0.0], [0.05, 0.02, 0.01]);
     part.extend(block([-0.01, -0.02, 0.01], [0.01, 0.02, 0.04]));
     let g = gripper(0.06, 0.05);
-    let all = judged(part, &g);
-    let ridge: Vec<&Judged> =
+    let all = assessed(part, &g);
+    let ridge: Vec<&Assessed> =
         all.iter().filter(|j| (j.handle.width - 0.02).abs() < 1e-4 && j.handle.closing.x.abs() > 0.99).collect();
-    let way = |d: Vec3| ridge.iter().find(|j| j.handle.approach.dot(&d) > 0.99).unwrap_or_else(|| panic!("{d:?}"));
-    assert_eq!(way(-Vec3::z()).reason, None);
-    assert!(matches!(way(Vec3::z()).reason, Some(Reason::Collides { .. })));
-    // From the front the claws pass beside the ridge, above the foot, only where there is room for them: 30 mm of height for 10 mm of claw.
+    let from = |d: Vec3| ridge.iter().find(|j| j.handle.approach.dot(&d) > 0.99).unwrap_or_else(|| panic!("{d:?}"));
+    assert_eq!(from(-Vec3::z()).reason, None);
+    assert!(matches!(from(Vec3::z()).reason, Some(Rejection::Collides { .. })));
+    // From the front the claws, 10 mm wide, pass beside the ridge above the foot, where 30 mm are free.
     assert!(
-        way(Vec3::y()).reason.is_none() || matches!(way(Vec3::y()).reason, Some(Reason::Collides { what: "body" }))
+        from(Vec3::y()).reason.is_none()
+            || matches!(from(Vec3::y()).reason, Some(Rejection::Collides { what: "body" }))
     );
-    assert!(all.iter().filter(|j| j.handle.width > 0.09).all(|j| matches!(j.reason, Some(Reason::TooWide { .. }))));
+    assert!(all.iter().filter(|j| j.handle.width > 0.09).all(|j| matches!(j.reason, Some(Rejection::TooWide { .. }))));
 }
 
 #[test]
@@ -254,5 +259,5 @@ fn a_scan_of_many_noisy_triangles_gives_the_cube_back() {
         }
     }
     assert!(corners.len() > 100_000);
-    assert_eq!(kept(&judged(corners, &gripper(0.06, 0.05))), 12);
+    assert_eq!(kept(&assessed(corners, &gripper(0.06, 0.05))), 12);
 }

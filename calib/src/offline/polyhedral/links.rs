@@ -1,13 +1,16 @@
-//! Which triangles lie beside which, also where a file's triangles share no edge: across cracks, and where one long edge meets several short.
+//! Adjacency of triangles, also where they share no edge: across cracks, and where one long edge meets several short
+//! ones.
 
 use super::bvh::Bvh;
 use super::mesh::Mesh;
 use graspd_rt::geom::Vec3;
 
-/// Open edges that are looked beyond at most; a mesh with more is a heap of triangles.
-const MOST_OPEN: usize = 200_000;
-/// Triangles at one edge that are all linked to each other at most.
-const MOST_AT_EDGE: usize = 8;
+/// Most open edges across which neighbours are searched; a mesh with more has no connected surface.
+const MAX_OPEN_EDGES: usize = 200_000;
+/// Most triangles at one edge that are linked to each other.
+const MAX_AT_EDGE: usize = 8;
+/// Widest crack across which triangles are linked, as a fraction of the diagonal of the mesh.
+const MAX_CRACK: f64 = 1e-5;
 
 /// Neighbours of every triangle.
 pub(super) struct Links {
@@ -16,7 +19,7 @@ pub(super) struct Links {
 }
 
 impl Links {
-    /// Finds the neighbours of every triangle of a mesh; `tree` is of the same mesh.
+    /// Finds the neighbours of every triangle of a mesh; `tree` is the hierarchy of the same mesh.
     pub(super) fn new(mesh: &Mesh, tree: &Bvh<'_>) -> Self {
         let mut edges: Vec<(u32, u32, u32)> = Vec::with_capacity(3 * mesh.triangles.len());
         for (t, [a, b, c]) in mesh.triangles.iter().enumerate() {
@@ -32,16 +35,17 @@ impl Links {
                 open.push((*p, *q, *t));
                 continue;
             }
-            for (i, x) in group.iter().take(MOST_AT_EDGE).enumerate() {
-                for y in group.iter().take(MOST_AT_EDGE).skip(i + 1) {
+            for (i, x) in group.iter().take(MAX_AT_EDGE).enumerate() {
+                for y in group.iter().take(MAX_AT_EDGE).skip(i + 1) {
                     pairs.extend([(x.2, y.2), (y.2, x.2)]);
                 }
             }
         }
-        // What touches the middle of an open edge lies beside it: of a long edge met by short ones, theirs lie on it.
-        let gap = 1e-5 * mesh.size().norm();
+        // A triangle that touches the middle of an open edge is a neighbour. If a long edge meets short ones, the
+        // middles of the short ones are on the long one.
+        let gap = MAX_CRACK * mesh.size().norm();
         let vertex = |k: u32| mesh.vertices.get(k as usize).copied().unwrap_or_default();
-        for (p, q, t) in open.iter().take(MOST_OPEN) {
+        for (p, q, t) in open.iter().take(MAX_OPEN_EDGES) {
             let middle = (vertex(*p) + vertex(*q)) * 0.5;
             tree.near(&middle, gap, |u| {
                 if u != *t && distance(&middle, &mesh.corners(u as usize)) <= gap {
@@ -65,7 +69,7 @@ impl Links {
         Self { start, list: pairs.into_iter().map(|p| p.1).collect() }
     }
 
-    /// Neighbours of a triangle.
+    /// The neighbours of a triangle, ascending.
     pub(super) fn of(&self, t: u32) -> &[u32] {
         let range = match (self.start.get(t as usize), self.start.get(t as usize + 1)) {
             (Some(a), Some(b)) => *a as usize..*b as usize,

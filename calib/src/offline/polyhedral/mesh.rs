@@ -4,7 +4,7 @@ use graspd_rt::geom::Vec3;
 use std::collections::{HashMap, HashSet};
 use std::hash::{BuildHasherDefault, Hasher};
 
-/// Triangles with shared vertices, metres, in the mesh's own frame.
+/// A triangle mesh in its own frame, metres.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mesh {
     /// Vertices.
@@ -14,8 +14,8 @@ pub struct Mesh {
 }
 
 impl Mesh {
-    /// Welds separate triangles. Those without area, those given twice and those with corners that are not finite are left out. `None` when
-    /// nothing is left.
+    /// Builds a mesh from separate triangles by merging equal corners. Degenerate triangles, duplicates and triangles
+    /// with corners that are not finite are left out. `None` if no triangle is left.
     pub fn from_corners(corners: impl IntoIterator<Item = [Vec3; 3]>) -> Option<Self> {
         let all: Vec<[Vec3; 3]> = corners
             .into_iter()
@@ -51,7 +51,7 @@ impl Mesh {
         ids.map(|k| self.vertices.get(k as usize).copied().unwrap_or_default())
     }
 
-    /// Edges of the bounding box, metres.
+    /// Size of the bounding box, metres.
     pub fn size(&self) -> Vec3 {
         let (mut lo, mut hi) = (Vec3::repeat(f64::INFINITY), Vec3::repeat(f64::NEG_INFINITY));
         for v in &self.vertices {
@@ -61,7 +61,7 @@ impl Mesh {
         hi - lo
     }
 
-    /// Area-weighted centre of the surface.
+    /// Centre of area of the surface.
     pub fn centre(&self) -> Vec3 {
         let (mut sum, mut area) = (Vec3::zeros(), 0.0);
         for t in 0..self.triangles.len() {
@@ -74,29 +74,30 @@ impl Mesh {
     }
 }
 
-/// Makes one of corners that are nearer to each other than single precision tells apart.
+/// Merges corners that single precision cannot distinguish, by a hash grid.
 struct Weld {
     lo: Vec3,
-    /// Corners this near are one, metres.
+    /// Corners within this distance are one vertex, metres.
     near: f64,
     known: HashMap<[i32; 3], Vec<u32>, Mix>,
     vertices: Vec<Vec3>,
 }
 
 impl Weld {
-    /// Side of a cell in units of `near`: most corners are further from its border than that, and have one cell to look into.
+    /// Side of a grid cell in units of `near`: most corners are farther than `near` from its border, so one cell is
+    /// searched.
     const CELL: f64 = 16.0;
 
     fn new(lo: Vec3, hi: Vec3) -> Self {
-        // Files hold single precision, of the distance from their origin too; a part may stand far from it.
-        let most = lo.iter().chain(hi.iter()).fold((hi - lo).norm(), |a, x| a.max(x.abs()));
-        Self { lo, near: (most * 2e-7).max(1e-12), known: HashMap::default(), vertices: Vec::new() }
+        // Files have single precision, relative to the distance from their origin; a part may be far from it.
+        let largest = lo.iter().chain(hi.iter()).fold((hi - lo).norm(), |a, x| a.max(x.abs()));
+        Self { lo, near: (largest * 2e-7).max(1e-12), known: HashMap::default(), vertices: Vec::new() }
     }
 
     fn index(&mut self, v: &Vec3) -> Option<u32> {
         let at = [0, 1, 2].map(|k| (v[k] - self.lo[k]) / (self.near * Self::CELL));
         let own = at.map(|x| x.floor() as i32);
-        // Cells that the corner is near to, along each axis: its own, and the next one where it stands at the border.
+        // The range of cells to search along each axis: the corner's own cell, and the next one if its border is near.
         let edge = 1.0 / Self::CELL;
         let reach = [0, 1, 2].map(|k| {
             let part = at[k] - at[k].floor();
@@ -122,7 +123,7 @@ impl Weld {
 
 type Mix = BuildHasherDefault<Mixer>;
 
-/// A plain multiplicative hash: a scan has a million corners, and nobody attacks the table but its own file's size.
+/// A plain multiplicative hash. A scan has a million corners, and the table needs no protection from chosen keys.
 #[derive(Default)]
 struct Mixer(u64);
 

@@ -1,9 +1,13 @@
-//! Parts with a CAD model (paper section 3.1): every box handle that parallel claws could take, and which of them can be taken here.
+//! Parts with a CAD model (paper section 3.1): all box handles that parallel claws can take, and which of them are
+//! possible in the present situation.
 //!
-//! [`read`] reads STL and OBJ into a [`Mesh`], and [`topology`] mends its windings. [`faces`] finds its flat faces, [`handles`] enumerates the pairs that two claws can oppose with every way of coming in,
-//! and [`filter`] drops those that this gripper, from here, cannot take, each with its reason. [`pose`] places the mesh from picked points.
+//! [`read`] reads STL and OBJ files into a [`Mesh`], and [`topology`] orients its triangles. [`faces`] finds the flat
+//! faces. [`handles`] enumerates the pairs of opposed faces and their approach directions. [`filter`] drops the handles
+//! that this gripper cannot take here, each with its [`constraints::Rejection`]. [`pose`] fits the pose of the mesh to
+//! picked points, and [`plan`] makes the plan.
 
 pub mod bvh;
+pub mod constraints;
 pub mod faces;
 pub mod filter;
 pub mod handles;
@@ -11,9 +15,10 @@ mod links;
 mod mesh;
 mod obj;
 pub mod overlay;
-mod place;
+mod placement;
 pub mod plan;
 pub mod pose;
+mod problem;
 mod raster;
 pub mod reach;
 pub mod read;

@@ -1,26 +1,26 @@
-//! OBJ: vertices and faces; everything else in it (texture, normals, groups, materials) says nothing about the shape.
+//! OBJ files: vertices and faces. Texture, normals, groups and materials are ignored; they do not affect the shape.
 
-use super::read::Problem;
+use super::problem::Problem;
 use graspd_rt::geom::Vec3;
 use nalgebra::Vector2;
 
-const FIX: &str = "repair or export the part again";
+const FIX: &str = "repair the part or export it again";
 
-/// Corners of every triangle, in the file's unit; faces of more corners are cut into triangles.
+/// Corners of every triangle, in the unit of the file. Larger polygons are triangulated.
 pub(super) fn read(bytes: &[u8]) -> Result<Vec<[Vec3; 3]>, Problem> {
     let mut text = String::from_utf8_lossy(bytes);
     if text.contains('\r') {
-        // Old programs end lines with a carriage return alone.
+        // Old programs end lines with CR.
         text = text.replace("\r\n", "\n").replace('\r', "\n").into();
     }
     let mut vertices: Vec<Vec3> = Vec::new();
-    // Corners of all faces; some programs write them before the vertices.
+    // Corner indices of all faces; some programs write faces before vertices.
     let mut corners: Vec<u32> = Vec::new();
     let mut faces: Vec<(usize, std::ops::Range<usize>)> = Vec::new();
     let mut open: Option<(usize, String)> = None;
     for (k, raw) in text.lines().enumerate() {
         let line = raw.split('#').next().unwrap_or("").trim_end();
-        // A backslash continues a line; errors name the line on which it began.
+        // A backslash continues a line; errors name the line on which it begins.
         let (line_no, line) = match open.take() {
             Some((from, before)) => (from, before + " " + line),
             None => (k + 1, line.to_owned()),
@@ -34,7 +34,7 @@ pub(super) fn read(bytes: &[u8]) -> Result<Vec<[Vec3; 3]>, Problem> {
         match words.next() {
             Some("v") => {
                 let xyz: Option<Vec<f64>> = words.map(|w| w.parse().ok()).collect();
-                // A weight or a colour may follow.
+                // A weight or a colour may follow the coordinates.
                 match xyz.as_deref() {
                     Some([x, y, z, ..]) if [x, y, z].iter().all(|v| v.is_finite()) => {
                         vertices.push(Vec3::new(*x, *y, *z));
@@ -47,11 +47,11 @@ pub(super) fn read(bytes: &[u8]) -> Result<Vec<[Vec3; 3]>, Problem> {
                 for w in words {
                     let first = w.split('/').next().unwrap_or("");
                     let index: i64 = first.parse().map_err(|_| wrong(format!("\"{w}\" is not a corner of a face")))?;
-                    // Counted from 1, or backwards from the last one read.
+                    // Indices count from 1, or backwards from the last vertex read.
                     let at = if index > 0 { Some(index - 1) } else { (vertices.len() as i64).checked_add(index) };
                     let at = at.and_then(|k| u32::try_from(k).ok()).filter(|_| index != 0);
                     corners.push(at.ok_or_else(|| {
-                        wrong(format!("the face names vertex {index}, but {} were read so far", vertices.len()))
+                        wrong(format!("the face names vertex {index}, but {} vertices precede it", vertices.len()))
                     })?);
                 }
                 if corners.len() - from < 3 {
@@ -64,8 +64,8 @@ pub(super) fn read(bytes: &[u8]) -> Result<Vec<[Vec3; 3]>, Problem> {
     }
     if let Some((line_no, _)) = open {
         return Err(Problem::new(
-            format!("line {line_no}: it ends inside a continued line"),
-            "the file is cut off: copy it again",
+            format!("line {line_no}: the file ends inside a continued line"),
+            "the file is cut off: copy or export it again",
         ));
     }
     let mut out = Vec::with_capacity(faces.len());
@@ -77,28 +77,30 @@ pub(super) fn read(bytes: &[u8]) -> Result<Vec<[Vec3; 3]>, Problem> {
             .iter()
             .map(|k| {
                 let count = vertices.len();
-                let wrong = || wrong(format!("the face names vertex {}, but the file has {count}", u64::from(*k) + 1));
+                let wrong =
+                    || wrong(format!("the face names vertex {}, but the file has {count} vertices", u64::from(*k) + 1));
                 vertices.get(*k as usize).copied().ok_or_else(wrong)
             })
             .collect::<Result<_, _>>()?;
-        cut(&face, &mut out)
+        triangulate(&face, &mut out)
             .ok_or_else(|| wrong(format!("the outline of a face with {} corners crosses itself", face.len())))?;
     }
     Ok(out)
 }
 
-/// Cuts a polygon into triangles by its ears: right for hollow outlines too, where a fan would cover what is not there.
-fn cut(corners: &[Vec3], out: &mut Vec<[Vec3; 3]>) -> Option<()> {
+/// Triangulates a polygon by ear clipping, which is correct for concave outlines too; a fan would cover area outside
+/// them. `None` if the outline crosses itself.
+fn triangulate(corners: &[Vec3], out: &mut Vec<[Vec3; 3]>) -> Option<()> {
     if let [a, b, c] = corners {
         out.push([*a, *b, *c]);
         return Some(());
     }
-    // Newell's normal: the area vector of the outline, flat or not.
+    // Newell's normal: the area vector of the outline, which need not be planar.
     let n = corners.len();
     let at = |k: usize| corners.get(k % n).copied().unwrap_or_default();
     let area: Vec3 = (0..n).map(|k| (at(k) - at(0)).cross(&(at(k + 1) - at(0)))).sum();
     let Some(normal) = area.try_normalize(1e-300) else {
-        // No area at all: nothing to hold or to hit.
+        // A polygon without area has no effect on grasps or collisions.
         return Some(());
     };
     let side = if normal.x.abs() < 0.9 { Vec3::x() } else { Vec3::y() };
@@ -115,12 +117,12 @@ fn cut(corners: &[Vec3], out: &mut Vec<[Vec3; 3]>) -> Option<()> {
     while left.len() > 3 {
         let m = left.len();
         let pick = |k: usize| left.get(k % m).copied().unwrap_or(0);
-        // Ears that touch no other corner first: one that does would leave an outline that touches itself.
+        // Prefer ears that touch no other corner: clipping one that does leaves an outline that touches itself.
         let ear_with = |margin: f64| {
             (0..m).find(|k| {
                 let (a, b, c) = (pick(k + m - 1), pick(*k), pick(k + 1));
                 let size = turn(a, b, c);
-                // A corner on the straight line between its neighbours is cut off as a triangle without area.
+                // A corner on the line between its neighbours is clipped as a degenerate triangle.
                 size.abs() <= slack
                     || (size > 0.0
                         && !left.iter().any(|p| {

@@ -1,28 +1,31 @@
-//! The image of a polyhedral plan: both views, the mesh's edges as they should lie on the part, the predicted gripper and marks, the picks.
+//! The overlay of a plan on a mesh: both views, the projected edges of the mesh, the predicted gripper and marks, the
+//! picks.
 
 use super::mesh::Mesh;
 use super::plan::{MeshPlan, Placed, Survey};
 use super::topology::edges;
 use crate::files::{GripperFile, RigFile};
 use crate::offline::drawing::canvas::{Face, Rgba};
-use crate::offline::drawing::overlay::{BRIGHT, CLICK, DIM, MARK, NORMAL, Panel, RIM, boxes, scales, sheet};
+use crate::offline::drawing::panel::{BRIGHT, CLICK, DIM, MARK, NORMAL, Panel, RIM, boxes};
+use crate::offline::drawing::sheet::{Column, scales, sheet};
 use crate::offline::edges::grey_image::GreyImage;
 use graspd_rt::geom::{Pixel, Pose, Vec3, View};
 use nalgebra::Point3;
 
-/// Two triangles with less than this cosine between their normals meet at an edge that is drawn: 25 degrees.
-const SHARP: f64 = 0.906;
-/// Edges drawn in a view at most.
-const MOST_EDGES: usize = 30_000;
+/// Largest cosine between the normals of two triangles whose common edge is drawn: 25 degrees.
+const MAX_COS_SHARP: f64 = 0.906;
+/// Most edges drawn in a view.
+const MAX_EDGES: usize = 30_000;
 
-/// Edges of a mesh that a view shows as lines: sharp and open ones, and the outline.
+/// An edge of a mesh that is drawn as a line: sharp, open, or on the outline.
 struct Line {
     a: Vec3,
     b: Vec3,
     hidden: bool,
 }
 
-/// Draws a plan; the bytes of a PNG file. Without images the views are empty. `None` only when the images are too large to be drawn.
+/// Draws a plan. Without images the views are grey. Returns the bytes of a PNG file; `None` if the images are too large
+/// to draw.
 pub fn draw(
     plan: &MeshPlan,
     survey: &Survey<'_>,
@@ -42,16 +45,16 @@ pub fn draw(
         (None, [Some(l), Some(r)]) => [l, r],
         _ => return None,
     };
-    let cuts = close_up(plan, mesh, placed, images, rig, gripper);
-    let cropped = [cuts[0].image(images[0])?, cuts[1].image(images[1])?];
+    let crops = close_up(plan, mesh, placed, images, rig, gripper);
+    let cropped = [crops[0].image(images[0])?, crops[1].image(images[1])?];
     let (zoom, unit) = scales([&cropped[0], &cropped[1]]);
     let mut panels = Vec::new();
-    for (view, (whole, cut)) in View::BOTH.into_iter().zip(images.into_iter().zip(cuts)) {
-        let near = cut.rig(view, rig);
+    for (view, (whole, crop)) in View::BOTH.into_iter().zip(images.into_iter().zip(crops)) {
+        let near = crop.rig(view, rig);
         let mut panel = Panel::new(&cropped[view.index()], view, &near, zoom)?;
-        draw_view(&mut panel, view, plan, survey, mesh, placed, &near, gripper, unit, &cut);
-        if cut.width < whole.width() {
-            inset(&mut panel, whole, view, rig, &cut, unit);
+        draw_view(&mut panel, view, plan, survey, mesh, placed, &near, gripper, unit, &crop);
+        if crop.width < whole.width() {
+            inset(&mut panel, whole, view, rig, &crop, unit);
         }
         panels.push(panel.canvas);
     }
@@ -63,7 +66,7 @@ pub fn draw(
             ("  ", DIM),
             ("mesh", BRIGHT),
             ("   edges of the part", RIM),
-            ("  way in", NORMAL),
+            ("  approach", NORMAL),
             ("  marks", MARK),
             ("  picks", CLICK),
         ],
@@ -74,14 +77,14 @@ pub fn draw(
 
 /// The part of a view that is drawn, pixels.
 #[derive(Clone, Copy, Debug)]
-struct Cut {
+struct Crop {
     x: usize,
     y: usize,
     width: usize,
     height: usize,
 }
 
-impl Cut {
+impl Crop {
     fn image(&self, whole: &GreyImage) -> Option<GreyImage> {
         let rows = (self.y..self.y + self.height).filter_map(|y| whole.row(y).get(self.x..self.x + self.width));
         GreyImage::new(self.width, self.height, rows.flatten().copied().collect())
@@ -91,7 +94,7 @@ impl Cut {
         Pixel::new(self.x as f64, self.y as f64)
     }
 
-    /// The rig as if the view's camera took only this part: its axis is where it was, so that its lens is the same.
+    /// The rig with the view's camera cropped to this part. The optical axis and the lens stay the same.
     fn rig(&self, view: View, rig: &RigFile) -> RigFile {
         let mut out = rig.clone();
         let camera = if view == View::Left { &mut out.rig.left } else { &mut out.rig.right };
@@ -102,12 +105,14 @@ impl Cut {
     }
 }
 
-/// The cut's sides are this much longer than what has to be in it, and at least this part of the image; a larger one is the whole image.
-const ROOM: f64 = 1.25;
-const LEAST_CUT: f64 = 0.12;
-const MOST_CUT: f64 = 0.7;
+/// Size of the crop relative to its content.
+const CROP_MARGIN: f64 = 1.25;
+/// Smallest crop as a fraction of the image.
+const MIN_CROP: f64 = 0.12;
+/// Crops larger than this fraction of the image are not worth it: the whole image is drawn.
+const MAX_CROP: f64 = 0.7;
 
-/// Where part and gripper are in both views, equally large in both.
+/// The crops of both views with part and gripper, of equal relative size.
 fn close_up(
     plan: &MeshPlan,
     mesh: &Mesh,
@@ -115,8 +120,8 @@ fn close_up(
     whole: [&GreyImage; 2],
     rig: &RigFile,
     gripper: &GripperFile,
-) -> [Cut; 2] {
-    let full = whole.map(|p| Cut { x: 0, y: 0, width: p.width(), height: p.height() });
+) -> [Crop; 2] {
+    let full = whole.map(|p| Crop { x: 0, y: 0, width: p.width(), height: p.height() });
     let (mut lo, mut hi) = (Vec3::repeat(f64::INFINITY), Vec3::repeat(f64::NEG_INFINITY));
     for v in &mesh.vertices {
         (lo, hi) = (lo.inf(v), hi.sup(v));
@@ -126,34 +131,35 @@ fn close_up(
     for pose in [&plan.set_point.pregrasp.left_from_gripper, &plan.set_point.grasp.left_from_gripper] {
         points.extend(boxes(gripper, plan.file.opening_m, pose).iter().flat_map(|(b, _)| b.corners()));
     }
-    let mut part = LEAST_CUT;
+    let mut part = MIN_CROP;
     let mut middles = [Pixel::zeros(); 2];
     for (view, (middle, size)) in View::BOTH.into_iter().zip(middles.iter_mut().zip(&full)) {
         let mut seen = points.iter().filter_map(|p| rig.rig.project(view, p));
         let Some(first) = seen.next() else { return full };
         let (a, b) = seen.fold((first, first), |(a, b), p| (a.inf(&p), b.sup(&p)));
         *middle = (a + b) * 0.5;
-        let d = (b - a) * ROOM;
+        let d = (b - a) * CROP_MARGIN;
         part = part.max(d.x / size.width as f64).max(d.y / size.height as f64);
     }
-    if !(part < MOST_CUT) {
+    if !(part < MAX_CROP) {
         return full;
     }
     let mut out = full;
-    for (cut, middle) in out.iter_mut().zip(middles) {
-        let (w, h) = ((part * cut.width as f64) as usize, (part * cut.height as f64) as usize);
+    for (crop, middle) in out.iter_mut().zip(middles) {
+        let (w, h) = ((part * crop.width as f64) as usize, (part * crop.height as f64) as usize);
         let from = |m: f64, size: usize, all: usize| (m - 0.5 * size as f64).clamp(0.0, (all - size) as f64) as usize;
-        *cut = Cut { x: from(middle.x, w, cut.width), y: from(middle.y, h, cut.height), width: w, height: h };
+        *crop = Crop { x: from(middle.x, w, crop.width), y: from(middle.y, h, crop.height), width: w, height: h };
     }
     out
 }
 
-/// The whole view, small in a corner, with a frame round what is drawn.
-fn inset(panel: &mut Panel<'_>, whole: &GreyImage, view: View, rig: &RigFile, cut: &Cut, unit: f64) {
+/// The whole view, small in a corner, with a frame around the crop.
+fn inset(panel: &mut Panel<'_>, whole: &GreyImage, view: View, rig: &RigFile, crop: &Crop, unit: f64) {
     let (w, h) = (f64::from(panel.canvas.pixmap.width()), f64::from(panel.canvas.pixmap.height()));
     let zoom = 0.22 * w / whole.width() as f64;
     let Some(mut small) = Panel::new(whole, view, rig, zoom) else { return };
-    let (a, b) = (small.raw(cut.offset()), small.raw(cut.offset() + Pixel::new(cut.width as f64, cut.height as f64)));
+    let (a, b) =
+        (small.raw(crop.offset()), small.raw(crop.offset() + Pixel::new(crop.width as f64, crop.height as f64)));
     let frame = [a, Pixel::new(b.x, a.y), b, Pixel::new(a.x, b.y), a].map(Some);
     small.canvas.line(&frame, RIM, 1.5 * unit, None);
     let (sw, sh) = (f64::from(small.canvas.pixmap.width()), f64::from(small.canvas.pixmap.height()));
@@ -174,7 +180,7 @@ fn draw_view(
     rig: &RigFile,
     gripper: &GripperFile,
     unit: f64,
-    cut: &Cut,
+    crop: &Crop,
 ) {
     let left = placed.left_from_mesh;
     let opening = plan.file.opening_m;
@@ -188,41 +194,30 @@ fn draw_view(
     }
     panel.gripper(&boxes(gripper, opening, &grasp), true, unit);
     if let (Some(a), Some(b)) = (panel.space(&pregrasp.translation.vector), panel.space(&grasp.translation.vector)) {
-        panel.canvas.arrow(a, b, [10, 20, 30, 160], 4.2 * unit);
-        panel.canvas.arrow(a, b, NORMAL, 2.4 * unit);
+        panel.arrow(a, b, NORMAL, unit);
     }
     let mut goal = plan.set_point.grasp;
     for px in goal.marks.iter_mut().flatten().flatten() {
-        *px -= cut.offset();
+        *px -= crop.offset();
     }
     panel.marks(&goal, gripper, unit);
     for (k, p) in placed.record.picked.iter().enumerate() {
         let px = if view == View::Left { p.left_px } else { p.right_px };
-        let at = panel.raw(Pixel::from(px) - cut.offset());
-        panel.canvas.ring(at, 6.0 * unit, [0, 0, 0, 180], 3.0 * unit);
-        panel.canvas.ring(at, 6.0 * unit, CLICK, 1.4 * unit);
-        // Where the pose puts the point that was picked.
+        let at = panel.raw(Pixel::from(px) - crop.offset());
+        panel.click(at, unit);
+        // The line to the projected point is the residual.
         if let Some(q) = panel.space(&(left * Point3::from(Vec3::from(p.point_m))).coords) {
             panel.canvas.segment(at, q, NORMAL, 1.2 * unit);
             panel.canvas.dot(q, 1.6 * unit, NORMAL);
         }
-        let beside = at + Pixel::new(-11.0, -9.0) * unit;
-        panel.canvas.label(beside, &format!("{}", k + 1), Face::Small, unit.round().max(1.0) as u32, CLICK);
+        let label = at + Pixel::new(-11.0, -9.0) * unit;
+        panel.canvas.label(label, &format!("{}", k + 1), Face::Small, unit.round().max(1.0) as u32, CLICK);
     }
-    let best = plan.set_point.best_view == view;
-    let name = match (view, best) {
-        (View::Left, true) => "left  *best view",
-        (View::Left, false) => "left",
-        (View::Right, true) => "right  *best view",
-        (View::Right, false) => "right",
-    };
-    let s = unit.round().max(1.0) as u32;
-    let w = Face::Bold.advance() * f64::from(s) * name.len() as f64;
-    panel.canvas.label(Pixel::new(12.0 * unit + 0.5 * w, 18.0 * unit), name, Face::Bold, s, BRIGHT);
+    panel.title(plan.set_point.best_view == view, unit);
 }
 
-/// The lines that an eye (in the mesh's frame) sees of a mesh.
-fn lines(mesh: &Mesh, survey: &Survey<'_>, eye: &Vec3) -> Vec<Line> {
+/// The lines of a mesh seen from a camera centre in the mesh frame.
+fn lines(mesh: &Mesh, survey: &Survey<'_>, centre: &Vec3) -> Vec<Line> {
     let normals = normals(mesh);
     let normal = |t: u32| normals.get(t as usize).copied().flatten();
     let vertex = |k: u32| mesh.vertices.get(k as usize).copied().unwrap_or_default();
@@ -233,31 +228,31 @@ fn lines(mesh: &Mesh, survey: &Survey<'_>, eye: &Vec3) -> Vec<Line> {
         let shown = match e.other {
             None => true,
             Some(other) => match (normal(e.one), normal(other)) {
-                (Some(m), Some(n)) => m.dot(&n) < SHARP || m.dot(&(eye - a)) * n.dot(&(eye - a)) < 0.0,
+                (Some(m), Some(n)) => m.dot(&n) < MAX_COS_SHARP || m.dot(&(centre - a)) * n.dot(&(centre - a)) < 0.0,
                 _ => false,
             },
         };
         if shown {
             let middle = (a + b) * 0.5;
-            out.push(Line { a, b, hidden: survey.tree().meets_segment(&middle, eye, skin) });
+            out.push(Line { a, b, hidden: survey.tree().meets_segment(&middle, centre, skin) });
         }
-        if out.len() >= MOST_EDGES {
+        if out.len() >= MAX_EDGES {
             break;
         }
     }
-    // Hidden ones first, so that the seen ones lie over them.
+    // Hidden lines first, so that the visible ones are drawn over them.
     out.sort_by_key(|l| !l.hidden);
     out
 }
 
-/// Triangles from which on a mesh is taken for a scan, whose crumples are no edges.
-const SCAN: usize = 20_000;
+/// Fewest triangles of a mesh that is treated as a scan, whose noise must not be drawn as edges.
+const MIN_SCAN_TRIANGLES: usize = 20_000;
 
-/// Unit normals of the triangles; of a scan, averaged over those around.
+/// Unit normals of the triangles, averaged over neighbours for a scan.
 fn normals(mesh: &Mesh) -> Vec<Option<Vec3>> {
     let mut out: Vec<Vec3> =
         (0..mesh.triangles.len()).map(|t| mesh.corners(t)).map(|[a, b, c]| (b - a).cross(&(c - a))).collect();
-    for _ in 0..if out.len() > SCAN { 2 } else { 0 } {
+    for _ in 0..if out.len() > MIN_SCAN_TRIANGLES { 2 } else { 0 } {
         let mut at = vec![Vec3::zeros(); mesh.vertices.len()];
         for (n, t) in out.iter().zip(&mesh.triangles) {
             for k in t {
@@ -273,16 +268,16 @@ fn normals(mesh: &Mesh) -> Vec<Option<Vec3>> {
     out.iter().map(|n| n.try_normalize(0.0)).collect()
 }
 
-/// The figures under the images.
-fn caption(plan: &MeshPlan, survey: &Survey<'_>, placed: &Placed) -> Vec<Vec<(&'static str, String)>> {
+/// The values under the images.
+fn caption(plan: &MeshPlan, survey: &Survey<'_>, placed: &Placed) -> Vec<Column> {
     let mm = |v: f64| format!("{:.1}", v * 1e3);
     let (o, m, j) = (&plan.file.object, &placed.record, &plan.chosen);
     let [x, y, z] = m.size_m.map(mm);
     let at = |p: &Pose| p.translation.vector.iter().map(|v| mm(*v)).collect::<Vec<_>>().join(", ");
     let first = vec![
         ("part", format!("{x} x {y} x {z} mm, {} triangles", m.triangles)),
-        ("place", format!("({}) mm", at(&placed.left_from_mesh))),
-        ("doubt", format!("{:.2} mm, {:.2}\u{b0}", o.sigma_centre_mm, o.sigma_normal_deg)),
+        ("position", format!("({}) mm", at(&placed.left_from_mesh))),
+        ("sigma", format!("{:.2} mm, {:.2}\u{b0}", o.sigma_centre_mm, o.sigma_normal_deg)),
     ];
     let picks = match m.rms_px {
         Some(rms) => format!("{}, rms {rms:.2} px", m.picked.len()),
@@ -290,14 +285,14 @@ fn caption(plan: &MeshPlan, survey: &Survey<'_>, placed: &Placed) -> Vec<Vec<(&'
     };
     let second = vec![
         ("handle", format!("{} mm wide, jaws {} mm", mm(j.handle.width), mm(j.opening))),
-        ("contact", format!("{:.0} mm2 a claw", j.contact * 1e6)),
+        ("contact", format!("{:.0} mm2 per claw", j.contact * 1e6)),
         ("picks", picks),
     ];
     let seen = |k: usize| plan.set_point.grasp.marks.get(k).map_or(0, |m| m.iter().flatten().count());
     let taken = survey.handles.iter().filter(|j| j.reason.is_none()).count();
     let third = vec![
         ("marks", format!("{} left, {} right", seen(0), seen(1))),
-        ("handles", format!("{taken} of {} can be taken", survey.handles.len())),
+        ("handles", format!("{taken} of {} possible", survey.handles.len())),
         ("grasp", format!("({}) mm", at(&plan.set_point.grasp.left_from_gripper))),
     ];
     vec![first, second, third]

@@ -1,8 +1,9 @@
-//! A plan for a part with a CAD model: pose, handles, the best one that can be taken, set-point.
+//! A plan for a part with a CAD model: the best possible handle at a known pose, and its set-point.
 
 use super::bvh::Bvh;
+use super::constraints::Constraints;
 use super::faces::{Flatness, faces};
-use super::filter::{Judged, MeshObstacle, Situation, judge};
+use super::filter::{Assessed, MeshObstacle, assess};
 use super::handles::{Opposition, enumerate};
 use super::mesh::Mesh;
 use super::reach::Arm;
@@ -10,38 +11,38 @@ use crate::files::{
     CandidateRecord, FileError, GripRecord, GripperFile, MeshRecord, ObjectRecord, PathRecord, PlanFile, PoseRecord,
     RigFile, SourceRecord,
 };
-use crate::offline::handle::grasp::LEAST_MARKS;
+use crate::offline::handle::grasp::{MIN_MARKS, marks_warning};
 use crate::offline::handle::setpoint::{Scene, fewest_on_the_way};
 use crate::offline::plan::{goal_record, worst};
 use graspd_rt::geom::{Pose, Vec3};
 use graspd_rt::setpoint::SetPoint;
 use nalgebra::Matrix6;
 
-/// What to aim at and what to allow.
+/// Options of a plan on a mesh.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MeshOptions {
     /// What counts as a flat face.
     pub flat: Flatness,
     /// What makes two faces a handle.
     pub opposition: Opposition,
-    /// Air between each claw and the part, metres.
+    /// Clearance between each claw and the part before closing, metres.
     pub clearance: f64,
-    /// Distance of the pre-grasp before the grasp along the approach, metres.
+    /// Distance of the pre-grasp from the grasp along the approach, metres.
     pub pregrasp: f64,
-    /// Smallest contact of each claw, square metres.
+    /// Smallest contact area of each claw, square metres.
     pub contact: f64,
-    /// Where the gripper is now in the left frame, if known.
+    /// Present pose `left_from_gripper`, if known.
     pub present: Option<Pose>,
-    /// Largest turn from there, radians.
+    /// Largest rotation from the present pose, radians.
     pub max_turn: Option<f64>,
-    /// Largest acceptable standard deviation of the handle's place, metres.
+    /// Largest accepted standard deviation of the handle's position, metres.
     pub max_sigma: f64,
-    /// Largest acceptable standard deviation of the gripper's orientation about any axis, radians.
+    /// Largest accepted standard deviation of the gripper's orientation about any axis, radians.
     pub max_sigma_turn: f64,
 }
 
-/// Candidates that go into the plan file at most; a scan may have thousands.
-const MOST_CANDIDATES: usize = 100;
+/// Most candidates in the plan file; a scan may have thousands.
+const MAX_CANDIDATES: usize = 100;
 
 impl Default for MeshOptions {
     fn default() -> Self {
@@ -60,96 +61,96 @@ impl Default for MeshOptions {
     }
 }
 
-/// A mesh and where it stands.
+/// A mesh and its pose.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Placed {
-    /// Maps the mesh's frame into the left camera's.
+    /// Pose of the mesh in the left camera's frame.
     pub left_from_mesh: Pose,
     /// Covariance of a small body motion `[v; w]` of the mesh (see [`super::pose::MeshPose`]), if known.
     pub covariance: Option<Matrix6<f64>>,
-    /// What goes into the plan about the mesh.
+    /// The plan's record of the mesh.
     pub record: MeshRecord,
-    /// What the operator should know about the mesh file.
+    /// Notes for the operator on defects of the mesh file.
     pub notes: Vec<String>,
 }
 
-/// Every handle of a part with its verdict.
+/// All handles of a part with the results of the filter.
 pub struct Survey<'a> {
     tree: Bvh<'a>,
-    /// Flat faces found.
+    /// Number of flat faces.
     pub faces: usize,
-    /// The handles: those that can be taken first, the best at the top.
-    pub handles: Vec<Judged>,
+    /// The handles: possible ones first, best first.
+    pub handles: Vec<Assessed>,
 }
 
 /// A plan on a mesh.
 #[derive(Clone, Debug)]
 pub struct MeshPlan {
-    /// What goes into the plan file.
+    /// The content of the plan file.
     pub file: PlanFile,
-    /// Its text.
+    /// The text of the plan file.
     pub text: String,
-    /// What goes to the loop.
+    /// The set-point of the on-line stage.
     pub set_point: SetPoint,
-    /// The handle chosen.
-    pub chosen: Judged,
+    /// The chosen handle.
+    pub chosen: Assessed,
 }
 
 /// Why there is no plan on a mesh.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum MeshPlanError {
-    /// A file is wrong.
+    /// A file is invalid.
     #[error(transparent)]
     File(#[from] FileError),
     /// The part has no opposed faces.
     #[error(
-        "the part has no two opposed, nearly parallel faces of at least {area_mm2:.0} mm2: parallel claws cannot take it; check --mesh-unit, or plan on a contour of it"
+        "the part has no two opposed, nearly parallel faces with an overlap of at least {area_mm2:.0} mm2, so parallel claws cannot take it: check --mesh-unit, or plan on a contour of the part"
     )]
     NoHandles {
-        /// The area asked for, square millimetres.
+        /// Smallest accepted overlap, square millimetres.
         area_mm2: f64,
     },
     /// Every handle was dropped.
-    #[error("none of the {count} handles of the part can be taken ({reasons}); --list names the reason of each")]
+    #[error("none of the {count} handles of the part can be taken ({reasons}); --list shows the reason of each")]
     AllDropped {
-        /// How many there are.
+        /// Number of handles.
         count: usize,
-        /// How many for which kind of reason.
+        /// Number of handles for each kind of reason.
         reasons: String,
     },
-    /// The handle asked for cannot be taken.
-    #[error("handle {number} cannot be taken: {reason}; --list shows those that can")]
+    /// The requested handle cannot be taken.
+    #[error("handle {number} cannot be taken: {reason}; --list shows the possible handles")]
     Dropped {
-        /// Its place in the list, counted from 1.
+        /// Number of the handle in the list, counted from 1.
         number: usize,
-        /// Why.
+        /// Why the handle was dropped.
         reason: String,
     },
     /// There is no such handle.
-    #[error("there is no handle {number}: the part has {count}")]
+    #[error("there is no handle {number}: the part has {count} handles")]
     NoSuchHandle {
-        /// What was asked for, counted from 1.
+        /// The requested number, counted from 1.
         number: usize,
-        /// How many there are.
+        /// Number of handles.
         count: usize,
     },
     /// The pose is too uncertain for the task.
     #[error(
-        "the handle's place is uncertain by {sigma_mm:.2} mm and {sigma_deg:.2} degrees (one sigma; {limit_mm:.2} mm and {limit_deg:.2} degrees allowed): pick more points, spread over the part, or allow more with --tolerance-mm and --tolerance-deg"
+        "the pose of the handle is uncertain by {sigma_mm:.2} mm and {sigma_deg:.2} degrees (one sigma), but {limit_mm:.2} mm and {limit_deg:.2} degrees are allowed: pick more points, spread over the part, or raise --tolerance-mm and --tolerance-deg"
     )]
     TooUncertain {
-        /// Standard deviation along the worst direction, millimetres.
+        /// Standard deviation of the position along the worst direction, millimetres.
         sigma_mm: f64,
-        /// The limit.
+        /// Its limit, millimetres.
         limit_mm: f64,
         /// Standard deviation of the orientation about the worst axis, degrees.
         sigma_deg: f64,
-        /// The limit.
+        /// Its limit, degrees.
         limit_deg: f64,
     },
 }
 
-/// Finds and judges every handle of a mesh at a known pose. With an arm, only what it can reach.
+/// Finds and tests all handles of a mesh at a known pose. The reach is tested if an arm is given.
 pub fn survey<'a>(
     mesh: &'a Mesh,
     left_from_mesh: &Pose,
@@ -161,7 +162,7 @@ pub fn survey<'a>(
     let tree = Bvh::new(mesh);
     let faces = faces(mesh, &tree, &options.flat);
     let found = enumerate(mesh, &faces, &options.opposition);
-    let situation = Situation {
+    let constraints = Constraints {
         rig: Some(&rig.rig),
         left_from_mesh: *left_from_mesh,
         clearance: options.clearance,
@@ -171,18 +172,18 @@ pub fn survey<'a>(
         present: options.present,
         max_turn: options.max_turn,
     };
-    let handles = judge(&found, &tree, gripper, &situation);
+    let handles = assess(&found, &tree, gripper, &constraints);
     Survey { tree, faces: faces.len(), handles }
 }
 
 impl Survey<'_> {
-    /// The tree over the mesh.
+    /// The bounding-volume tree of the mesh.
     pub(super) fn tree(&self) -> &Bvh<'_> {
         &self.tree
     }
 
-    /// The best handle, or the one of a number (counted from 1).
-    fn choose(&self, number: Option<usize>, options: &MeshOptions) -> Result<&Judged, MeshPlanError> {
+    /// The best handle, or the one with a number counted from 1.
+    fn choose(&self, number: Option<usize>, options: &MeshOptions) -> Result<&Assessed, MeshPlanError> {
         let Some(first) = self.handles.first() else {
             return Err(MeshPlanError::NoHandles { area_mm2: options.opposition.area * 1e6 });
         };
@@ -206,7 +207,10 @@ impl Survey<'_> {
         Err(MeshPlanError::AllDropped { count, reasons })
     }
 
-    /// Plans on the best handle, or on the one of a number in [`Survey::handles`] (counted from 1).
+    /// Plans on the best handle, or on the one with a number in [`Survey::handles`], counted from 1.
+    ///
+    /// # Errors
+    /// The part has no handle, the handle cannot be taken, or the pose of the part is too uncertain.
     pub fn plan(
         &self,
         placed: &Placed,
@@ -223,7 +227,7 @@ impl Survey<'_> {
         let scene = Scene::new(&rig.rig, gripper, chosen.opening, Some(&obstacle));
         let object = object_record(chosen, placed, options)?;
         let (warnings, path) = self.warnings(chosen, placed, gripper, &scene, [&pregrasp, &grasp], &object, options);
-        let candidate = self.handles.iter().take(MOST_CANDIDATES).map(|j| record(j, &left_from_mesh, chosen)).collect();
+        let candidate = self.handles.iter().take(MAX_CANDIDATES).map(|j| record(j, &left_from_mesh, chosen)).collect();
         let file = PlanFile {
             schema: PlanFile::SCHEMA.to_owned(),
             best_view: if chosen.visibility[0] >= chosen.visibility[1] { "left" } else { "right" }.to_owned(),
@@ -246,7 +250,7 @@ impl Survey<'_> {
             model: Vec::new(),
             candidate,
         };
-        // Read back as the loop would, so that a plan which it would refuse is never handed out.
+        // Read the plan back as the loop does, so that a plan that it would refuse is never returned.
         let text = file.to_toml();
         let again = PlanFile::parse(&text, "plan.toml")?;
         let set_point = again.set_point(&text, "plan.toml", ("the rig file", rig), ("the gripper file", gripper))?;
@@ -256,7 +260,7 @@ impl Survey<'_> {
     #[allow(clippy::too_many_arguments)]
     fn warnings(
         &self,
-        chosen: &Judged,
+        chosen: &Assessed,
         placed: &Placed,
         gripper: &GripperFile,
         scene: &Scene<'_>,
@@ -267,28 +271,24 @@ impl Survey<'_> {
         let mut out = placed.notes.clone();
         let marks = gripper.gripper.marks.len();
         for (name, seen) in ["left", "right"].iter().zip(chosen.seen) {
-            if seen < LEAST_MARKS {
-                out.push(format!("the {name} camera will see only {seen} of {marks} marks at the goal: the stacked loop will lean on the other view"));
-            } else if seen < marks {
-                out.push(format!("the {name} camera will see {seen} of {marks} marks at the goal"));
-            }
+            out.extend(marks_warning(name, seen, marks));
         }
-        // Doubt across the claws is what makes one of them land on the part.
+        // A position error along the closing direction makes a claw collide with the part.
         let x = Vec3::from(object.axis_a);
         let cov = nalgebra::Matrix3::from_fn(|i, j| object.covariance_centre_m2[i][j]);
         let sigma = x.dot(&(cov * x)).max(0.0).sqrt();
         if 2.0 * sigma > options.clearance {
             out.push(format!(
-                "the part's place is uncertain by {:.1} mm (two sigma) along the closing direction, the claws have {:.1} mm of air: pick more points, or give more --clearance",
+                "the position of the part is uncertain by {:.1} mm (two sigma) along the closing direction, but the clearance of the claws is {:.1} mm: pick more points, or raise --clearance",
                 2e3 * sigma,
                 1e3 * options.clearance
             ));
         }
         let path = options.present.map(|present| {
             let [l, r] = fewest_on_the_way(scene, &[present, *pregrasp, *grasp], 20);
-            if l.0 < LEAST_MARKS && r.0 < LEAST_MARKS {
+            if l.0 < MIN_MARKS && r.0 < MIN_MARKS {
                 out.push(format!(
-                    "on the way from the present pose only {} and {} marks are seen (at {:.0} % and {:.0} % of it): start nearer, or move the rig",
+                    "on the path from the present pose only {} marks are visible left and {} right (at {:.0} % and {:.0} % of the path): start nearer, or move the rig",
                     l.0, r.0, 100.0 * l.1, 100.0 * r.1
                 ));
             }
@@ -304,13 +304,14 @@ impl Survey<'_> {
     }
 }
 
-/// The handle as the plan's object: origin at the grasp, z against the approach, x along the closing direction.
-fn object_record(chosen: &Judged, placed: &Placed, options: &MeshOptions) -> Result<ObjectRecord, MeshPlanError> {
+/// The plan's record of a handle. Object frame: origin at the grasp, z against the approach, x along the closing
+/// direction.
+fn object_record(chosen: &Assessed, placed: &Placed, options: &MeshOptions) -> Result<ObjectRecord, MeshPlanError> {
     let left_from_mesh = placed.left_from_mesh;
     let grasp = left_from_mesh * chosen.mesh_from_gripper;
     let normal = -(grasp.rotation * Vec3::z());
     let centre = grasp.translation.vector;
-    // What the pose's doubt means at the grasp: the mesh's body motion carried to the gripper's origin.
+    // The covariance of the mesh's body motion, propagated to the gripper's origin.
     let lever = chosen.mesh_from_gripper.translation.vector;
     let skew = nalgebra::Matrix3::new(0.0, -lever.z, lever.y, lever.z, 0.0, -lever.x, -lever.y, lever.x, 0.0);
     let r = left_from_mesh.rotation.to_rotation_matrix();
@@ -331,9 +332,10 @@ fn object_record(chosen: &Judged, placed: &Placed, options: &MeshOptions) -> Res
     );
     let to_object = (frame.rotation.inverse() * left_from_mesh.rotation).to_rotation_matrix();
     let turn = to_object.matrix() * cov_turn * to_object.matrix().transpose();
-    // A small rotation w moves the normal by (w_y, -w_x) in the object's frame.
+    // A small rotation w moves the normal by (w_y, -w_x) in the object frame.
     let cov_normal = nalgebra::Matrix2::new(turn[(1, 1)], -turn[(0, 1)], -turn[(0, 1)], turn[(0, 0)]);
-    // A turn about the approach leaves the normal where it is, but not the claws on the faces: the limit is for all three.
+    // The limit applies to all three axes: a rotation about the approach moves the claws on the faces, though not the
+    // normal.
     let (sigma, sigma_turn) = (worst(&cov_centre), worst(&turn));
     if !(sigma <= options.max_sigma && sigma_turn <= options.max_sigma_turn) {
         return Err(MeshPlanError::TooUncertain {
@@ -360,9 +362,9 @@ fn object_record(chosen: &Judged, placed: &Placed, options: &MeshOptions) -> Res
     })
 }
 
-fn record(j: &Judged, left_from_mesh: &Pose, best: &Judged) -> CandidateRecord {
-    // The angle of the closing direction against the chosen one, so that handles can be told apart in the file.
-    let x = |j: &Judged| left_from_mesh.rotation * (j.mesh_from_gripper.rotation * Vec3::x());
+fn record(j: &Assessed, left_from_mesh: &Pose, best: &Assessed) -> CandidateRecord {
+    // The angle between the closing directions of this handle and the chosen one.
+    let x = |j: &Assessed| left_from_mesh.rotation * (j.mesh_from_gripper.rotation * Vec3::x());
     CandidateRecord {
         angle_deg: x(j).angle(&x(best)).to_degrees(),
         opening_m: j.opening,

@@ -1,80 +1,81 @@
-//! Where a mesh stands, from points of it that were picked in both images.
+//! The pose of a mesh from points picked in both images.
 
 use crate::offline::edges::lens::Lens;
 use graspd_rt::geom::{Pixel, Pose, Rig, Vec3, View, exp_twist};
 use nalgebra::{Matrix3, Matrix6, Point3, UnitQuaternion, Vector6};
 
-/// A point of the mesh and where it was picked.
+/// A point of the mesh and its picked pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Picked {
-    /// The point in the mesh's frame, metres.
+    /// The point in the mesh frame, metres.
     pub point: Vec3,
-    /// Its pixel in the left image.
+    /// Picked pixel in the left image.
     pub left: Pixel,
-    /// Its pixel in the right image.
+    /// Picked pixel in the right image.
     pub right: Pixel,
 }
 
-/// A mesh's pose with what speaks for it.
+/// The pose of a mesh and its uncertainty.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MeshPose {
-    /// Maps the mesh's frame into the left camera's.
+    /// Pose of the mesh in the left camera's frame.
     pub left_from_mesh: Pose,
     /// Root mean square reprojection error over both views, pixels.
     pub rms_px: f64,
-    /// Covariance of a small body motion `[v; w]` of the mesh, metres and radians, for picks of the scatter seen.
+    /// Covariance of a small body motion `[v; w]` of the mesh, metres and radians, for the observed scatter of the
+    /// picks.
     pub covariance: Matrix6<f64>,
 }
 
-/// Why picked points give no pose.
+/// Why picked points do not give a pose.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PickError {
     /// Too few points.
-    #[error("{0} points were picked, at least 3 are needed, better 5 or more spread over the part")]
+    #[error("{0} points were picked: pick at least 3, better 5 or more, spread over the part")]
     TooFew(usize),
-    /// Points on one line, or a pixel that is none.
+    /// The points are collinear, or a number is NaN or infinite.
     #[error("the picked points do not determine a pose ({0}): pick corners that are spread over the part")]
     Degenerate(&'static str),
-    /// The rays of a pick diverge.
+    /// The viewing rays of a pick do not intersect in front of the cameras.
     #[error(
-        "the two pixels of picked point {0} do not meet in front of the cameras: check that its left and right pixels are not exchanged"
+        "the viewing rays of picked point {0} do not meet in front of the cameras: check that its left and right pixels are not exchanged"
     )]
     Behind(usize),
     /// One pick does not fit the others.
     #[error(
-        "picked point {worst} is {error_px:.1} px from where the others put it (limit {limit_px:.1}): pick it again, or check which corner of the mesh it is"
+        "picked point {worst} is {error_px:.1} px away from its position by the other picks (limit {limit_px:.1} px): pick it again, or check which corner of the mesh it is"
     )]
     Outlier {
-        /// Its place in the list, counted from 1.
+        /// Number of the pick, counted from 1.
         worst: usize,
         /// Its reprojection error, pixels.
         error_px: f64,
-        /// The limit.
+        /// The limit, pixels.
         limit_px: f64,
     },
     /// Some picks do not fit the others.
     #[error(
-        "picked points {which} are up to {error_px:.1} px from where the other {others} put them (limit {limit_px:.1}): pick them again, or check which corners of the mesh they are"
+        "picked points {which} are up to {error_px:.1} px away from their positions by the other {others} picks (limit {limit_px:.1} px): pick them again, or check which corners of the mesh they are"
     )]
     Outliers {
-        /// Their places in the list, counted from 1.
+        /// Numbers of the picks, counted from 1.
         which: String,
-        /// How many agree.
+        /// Number of picks that agree.
         others: usize,
-        /// The largest reprojection error, pixels.
+        /// Largest reprojection error, pixels.
         error_px: f64,
-        /// The limit.
+        /// The limit, pixels.
         limit_px: f64,
     },
-    /// Two picks were exchanged.
+    /// Two picks are exchanged.
     #[error("picked points {0} and {1} are exchanged: each fits the pixels of the other")]
     Exchanged(usize, usize),
-    /// The picks are those of the mirrored mesh.
+    /// The picks fit the mirror image of the mesh.
     #[error(
         "the picked points fit the mirror image of the mesh, not the mesh: check which corners were picked, or whether the mesh was exported mirrored"
     )]
     Mirrored,
-    /// The picks are those of a mesh of another size.
+    /// The picks fit a mesh of another size.
     #[error("the picked points fit a part {0:.3} times as large as the mesh: check --mesh-unit")]
     Scale(f64),
     /// No majority of the picks agrees on a pose.
@@ -82,32 +83,34 @@ pub enum PickError {
         "no pose fits more than {agree} of the {count} picked points within {limit_px:.1} px: check which corners of the mesh were picked"
     )]
     Contradiction {
-        /// Most picks that agree.
+        /// Largest number of picks that agree.
         agree: usize,
-        /// All of them.
+        /// Number of picks.
         count: usize,
         /// The limit, pixels.
         limit_px: f64,
     },
 }
 
-/// Nobody picks a corner better than this, however well few picks happen to agree, pixels.
-const LEAST_SIGMA_PX: f64 = 0.2;
-/// Triples of picks from which a pose is tried when not all agree.
-const MOST_TRIPLES: usize = 4000;
-/// Picks stand on one line when their second spread is less than this part of the first (of the variances; a hundredth in lengths).
-const LINE: f64 = 1e-4;
-/// A part that is this much larger or smaller than its mesh has another unit, or is another part.
-const OTHER_SIZE: f64 = 0.02;
+/// Smallest standard deviation assumed for a picked pixel, pixels: a few picks may agree better than anyone can pick.
+const MIN_SIGMA_PX: f64 = 0.2;
+/// Most triples of picks from which a pose is tried if not all picks agree.
+const MAX_TRIPLES: usize = 4000;
+/// Smallest ratio of the second to the first principal variance of points that are not collinear (1/100 in lengths).
+const MIN_VARIANCE_RATIO: f64 = 1e-4;
+/// Largest relative difference between the size of the part and that of its mesh: beyond it the unit is wrong, or the
+/// part.
+const MAX_SCALE_ERROR: f64 = 0.02;
 
-/// Fits the mesh's pose to picked points: triangulation and the closed form of Horn, then least squares on all pixels. Needs no first guess.
+/// Fits the pose of a mesh to picked points: triangulation, Horn's closed form, then least squares on all pixels. Needs
+/// no initial value.
 ///
-/// The covariance takes the noise of a pixel from the picks' own scatter: with `d` degrees of freedom, the sum of squares over `d - 2`, so that the
-/// mean squared Mahalanobis distance of the true pose is 6 however few they are.
+/// The covariance takes the pixel noise from the scatter of the picks: with `d` degrees of freedom, the sum of squares
+/// over `d - 2`, so that the mean squared Mahalanobis distance of the true pose is 6 for any number of picks.
 ///
 /// # Errors
-/// Too few picks, picks on one line, and every way in which they contradict each other by more than `limit_px`: which of them do not fit, whether
-/// two were exchanged, whether the mesh is mirrored or of another size.
+/// Too few or collinear picks, or picks that contradict each other by more than `limit_px`: the error names the picks
+/// that do not fit, or says that two are exchanged, that the mesh is mirrored, or that it has another size.
 pub fn fit(rig: &Rig, picked: &[Picked], limit_px: f64) -> Result<MeshPose, PickError> {
     if picked.len() < 3 {
         return Err(PickError::TooFew(picked.len()));
@@ -115,10 +118,10 @@ pub fn fit(rig: &Rig, picked: &[Picked], limit_px: f64) -> Result<MeshPose, Pick
     let finite =
         |p: &Picked| [p.left.x, p.left.y, p.right.x, p.right.y].iter().chain(p.point.iter()).all(|v| v.is_finite());
     if !picked.iter().all(finite) {
-        return Err(PickError::Degenerate("a number is not finite"));
+        return Err(PickError::Degenerate("a number is NaN or infinite"));
     }
     if !spread(picked) {
-        return Err(PickError::Degenerate("they lie on one line"));
+        return Err(PickError::Degenerate("they are on one line"));
     }
     let lenses = View::BOTH.map(|v| Lens::new(rig.camera(v)));
     let seen: Vec<Option<Vec3>> = picked.iter().map(|p| triangulate(rig, &lenses, p)).collect();
@@ -131,14 +134,14 @@ pub fn fit(rig: &Rig, picked: &[Picked], limit_px: f64) -> Result<MeshPose, Pick
         let (pose, information) = found;
         let sum: f64 = picked.iter().flat_map(|p| errors(rig, &pose, p)).map(|e| e * e).sum();
         let freedom = (4 * picked.len()) as f64 - 6.0;
-        let sigma2 = (sum / (freedom - 2.0)).max(LEAST_SIGMA_PX * LEAST_SIGMA_PX);
-        let covariance = information.try_inverse().ok_or(PickError::Degenerate("they lie on one line"))? * sigma2;
+        let sigma2 = (sum / (freedom - 2.0)).max(MIN_SIGMA_PX * MIN_SIGMA_PX);
+        let covariance = information.try_inverse().ok_or(PickError::Degenerate("they are on one line"))? * sigma2;
         return Ok(MeshPose { left_from_mesh: pose, rms_px: (sum / (2.0 * picked.len() as f64)).sqrt(), covariance });
     }
     Err(explain(&all, &known, limit_px))
 }
 
-/// Picks with the places in space where their rays meet.
+/// Picks with their triangulated points.
 struct Trial<'a> {
     rig: &'a Rig,
     picked: &'a [Picked],
@@ -146,7 +149,7 @@ struct Trial<'a> {
 }
 
 impl Trial<'_> {
-    /// The pose and information by some of the picks.
+    /// The pose from some of the picks, and its information matrix.
     fn of(&self, some: &[usize]) -> Option<(Pose, Matrix6<f64>)> {
         let picks: Vec<Picked> = some.iter().filter_map(|k| self.picked.get(*k).copied()).collect();
         let seen: Vec<Vec3> = some.iter().filter_map(|k| self.seen.get(*k).copied().flatten()).collect();
@@ -163,7 +166,7 @@ impl Trial<'_> {
         self.errors(pose).into_iter().fold(0.0, f64::max)
     }
 
-    /// The picks of the pose on which most agree, by trying triples.
+    /// The largest set of picks that agree on a pose, found by trying triples.
     fn consensus(&self, known: &[usize], limit: f64) -> Vec<usize> {
         let n = known.len();
         let mut triples = Vec::new();
@@ -172,7 +175,7 @@ impl Trial<'_> {
                 triples.extend((j + 1..n).map(|k| [i, j, k]));
             }
         }
-        let step = triples.len().div_ceil(MOST_TRIPLES).max(1);
+        let step = triples.len().div_ceil(MAX_TRIPLES).max(1);
         let within = |pose: &Pose, limit: f64| -> Vec<usize> {
             self.errors(pose).iter().enumerate().filter(|(_, e)| **e <= limit).map(|(k, _)| k).collect()
         };
@@ -180,7 +183,7 @@ impl Trial<'_> {
         for t in triples.into_iter().step_by(step) {
             let some = t.map(|i| known.get(i).copied().unwrap_or(0));
             let Some((mut pose, _)) = self.of(&some) else { continue };
-            // Three picks put the far end of a part roughly: those near the pose join it, then those that agree stay.
+            // A pose from three picks is inaccurate at the far end of a part: start with a wide limit, then tighten it.
             for wide in [4.0, 2.0, 1.0] {
                 let agree = within(&pose, wide * limit);
                 match self.of(&agree) {
@@ -198,7 +201,7 @@ impl Trial<'_> {
     }
 }
 
-/// In which way picks contradict each other.
+/// Determines how the picks contradict each other.
 fn explain(all: &Trial<'_>, known: &[usize], limit_px: f64) -> PickError {
     let (picked, n) = (all.picked, all.picked.len());
     let fits = |picks: &[Picked], seen: &[Option<Vec3>]| {
@@ -206,7 +209,7 @@ fn explain(all: &Trial<'_>, known: &[usize], limit_px: f64) -> PickError {
         trial.of(known).is_some_and(|f| trial.worst(&f.0) <= limit_px)
     };
     if known.len() == n && n > 3 {
-        // Spread in space against spread on the mesh: one number, right if nothing else is wrong.
+        // The ratio of the spread in space to that on the mesh is the scale, if nothing else is wrong.
         let size = |points: &mut dyn Iterator<Item = Vec3>| {
             let points: Vec<Vec3> = points.collect();
             let centre = points.iter().sum::<Vec3>() / n as f64;
@@ -216,13 +219,13 @@ fn explain(all: &Trial<'_>, known: &[usize], limit_px: f64) -> PickError {
             size(&mut all.seen.iter().flatten().copied()) / size(&mut picked.iter().map(|p| p.point)).max(1e-300);
         let with =
             |f: &dyn Fn(Vec3) -> Vec3| picked.iter().map(|p| Picked { point: f(p.point), ..*p }).collect::<Vec<_>>();
-        if (scale - 1.0).abs() > OTHER_SIZE && fits(&with(&|p| p * scale), all.seen) {
+        if (scale - 1.0).abs() > MAX_SCALE_ERROR && fits(&with(&|p| p * scale), all.seen) {
             return PickError::Scale(scale);
         }
         if fits(&with(&|p| Vec3::new(-p.x, p.y, p.z)), all.seen) {
             return PickError::Mirrored;
         }
-        for (i, j) in (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j))).take(MOST_TRIPLES) {
+        for (i, j) in (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j))).take(MAX_TRIPLES) {
             let mut picks = picked.to_vec();
             if let (Some(a), Some(b)) = (picked.get(i), picked.get(j)) {
                 let points = [a.point, b.point];
@@ -241,12 +244,12 @@ fn explain(all: &Trial<'_>, known: &[usize], limit_px: f64) -> PickError {
     if 2 * agree.len() <= n || agree.len() < 3 {
         return PickError::Contradiction { agree: agree.len(), count: n, limit_px };
     }
-    let Some((pose, _)) = all.of(&agree) else { return PickError::Degenerate("they lie on one line") };
+    let Some((pose, _)) = all.of(&agree) else { return PickError::Degenerate("they are on one line") };
     let errors = all.errors(&pose);
     let out: Vec<usize> = (0..n).filter(|k| !agree.contains(k)).collect();
     let error_px = out.iter().filter_map(|k| errors.get(*k)).copied().fold(0.0, f64::max);
     match out.as_slice() {
-        // Behind a camera it has no pixel at all.
+        // A point behind a camera has no pixel, and thus an infinite error.
         [k] if !error_px.is_finite() => PickError::Behind(k + 1),
         [k] => PickError::Outlier { worst: k + 1, error_px, limit_px },
         _ => {
@@ -256,18 +259,20 @@ fn explain(all: &Trial<'_>, known: &[usize], limit_px: f64) -> PickError {
     }
 }
 
-/// Distances of a pick's pixels from where a pose puts its point, left and right.
+/// Reprojection errors of a pick at a pose, left and right, pixels; infinite for a point behind the camera.
 fn errors(rig: &Rig, pose: &Pose, p: &Picked) -> [f64; 2] {
     residuals(rig, pose, p).map(|r| r.map_or(f64::INFINITY, |r| r.norm()))
 }
 
-/// What a pick's pixels, left and right, differ by from where a pose puts its point; `None` where that is behind the camera.
+/// Residuals of a pick at a pose, left and right: picked pixel minus projected point; `None` for a point behind the
+/// camera.
 pub fn residuals(rig: &Rig, left_from_mesh: &Pose, p: &Picked) -> [Option<Pixel>; 2] {
     let x = (left_from_mesh * Point3::from(p.point)).coords;
     [(View::Left, p.left), (View::Right, p.right)].map(|(view, px)| rig.project(view, &x).map(|q| px - q))
 }
 
-/// Least squares on the pixels from a pose near the solution: the pose, and the information of a small body motion for pixels of unit noise.
+/// Levenberg-Marquardt on the pixels, from a pose near the solution. Returns the pose and the information matrix of a
+/// small body motion for unit pixel noise.
 fn refine(rig: &Rig, picked: &[Picked], mut pose: Pose) -> Option<(Pose, Matrix6<f64>)> {
     let cost = |pose: &Pose| -> f64 { picked.iter().flat_map(|p| errors(rig, pose, p)).map(|e| e * e).sum() };
     let mut now = cost(&pose);
@@ -313,7 +318,7 @@ fn refine(rig: &Rig, picked: &[Picked], mut pose: Pose) -> Option<(Pose, Matrix6
     Some((pose, information))
 }
 
-/// Whether picks spread over more than a line.
+/// Whether the picked points are not collinear.
 fn spread(picked: &[Picked]) -> bool {
     let centre = picked.iter().map(|p| p.point).sum::<Vec3>() / picked.len().max(1) as f64;
     let mut m = Matrix3::zeros();
@@ -323,10 +328,10 @@ fn spread(picked: &[Picked]) -> bool {
     let Some(e) = m.try_symmetric_eigen(1e-14, 100) else { return false };
     let mut e: [f64; 3] = e.eigenvalues.into();
     e.sort_by(f64::total_cmp);
-    e[1] > LINE * e[2] && e[2] > 0.0
+    e[1] > MIN_VARIANCE_RATIO * e[2] && e[2] > 0.0
 }
 
-/// The point nearest to both viewing rays, in the left frame.
+/// The point nearest to both viewing rays, left frame; `None` if it is behind a camera.
 fn triangulate(rig: &Rig, lenses: &[Lens; 2], p: &Picked) -> Option<Vec3> {
     let mut a = Matrix3::zeros();
     let mut b = Vec3::zeros();
@@ -344,7 +349,8 @@ fn triangulate(rig: &Rig, lenses: &[Lens; 2], p: &Picked) -> Option<Vec3> {
     (front && x.iter().all(|v| v.is_finite())).then_some(x)
 }
 
-/// Horn's closed form: the rotation that turns the mesh's points onto those seen is the largest eigenvector of a 4x4 matrix.
+/// Horn's closed form: the quaternion that rotates the mesh's points to the triangulated ones is the eigenvector of the
+/// largest eigenvalue of a symmetric 4x4 matrix.
 fn align(picked: &[Picked], seen: &[Vec3]) -> Option<Pose> {
     let n = picked.len() as f64;
     let (ca, cb) = (picked.iter().map(|p| p.point).sum::<Vec3>() / n, seen.iter().sum::<Vec3>() / n);

@@ -1,4 +1,5 @@
-//! A mesh's pose from picks: right from any orientation, as sure as it says, and every wrong set of picks refused in its own words.
+//! The pose of a mesh from picks: correct from any orientation, with a consistent covariance, and a specific error for
+//! each kind of wrong picks.
 
 use super::*;
 use graspd_rt::geom::{Camera, Distortion};
@@ -47,8 +48,8 @@ fn picks(pose: &Pose, sigma: f64, seed: u64, points: &[[f64; 3]]) -> Vec<Picked>
         .collect()
 }
 
-/// A pose before both cameras, in any orientation.
-fn anywhere(seed: u64) -> Pose {
+/// A pose in front of both cameras, with a random orientation.
+fn random_pose(seed: u64) -> Pose {
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
     let n = Normal::new(0.0, 1.0).unwrap();
     let q = nalgebra::Quaternion::new(n.sample(&mut rng), n.sample(&mut rng), n.sample(&mut rng), n.sample(&mut rng));
@@ -59,25 +60,25 @@ fn anywhere(seed: u64) -> Pose {
 #[test]
 fn exact_picks_give_the_pose_from_any_orientation() {
     for seed in 0..200 {
-        let truth = anywhere(seed);
+        let truth = random_pose(seed);
         let n = 3 + (seed % 7) as usize;
         let found = fit(&rig(), &picks(&truth, 0.0, 0, &CORNERS[..n]), 2.0).unwrap();
         assert!((found.left_from_mesh.translation.vector - truth.translation.vector).norm() < 1e-8, "{seed}");
         assert!(found.left_from_mesh.rotation.angle_to(&truth.rotation) < 1e-7, "{seed}");
     }
-    // Four corners of a square and eight of a cube spread alike in two and three directions.
+    // The corners of a square and of a cube have equal spread along two and three directions.
     let cube: Vec<[f64; 3]> = (0..8).map(|i| [0, 1, 2].map(|k| if i >> k & 1 == 1 { 0.03 } else { -0.03 })).collect();
     for points in [&cube[..4], &cube[..]] {
-        assert!(fit(&rig(), &picks(&anywhere(3), 0.3, 0, points), 5.0).is_ok());
+        assert!(fit(&rig(), &picks(&random_pose(3), 0.3, 0, points), 5.0).is_ok());
     }
 }
 
 #[test]
-fn the_covariance_is_what_the_pose_scatters_by() {
+fn the_covariance_matches_the_scatter_of_the_pose() {
     for (n, sigma, trials) in [(9, 0.5, 500), (5, 0.5, 500), (4, 2.0, 500)] {
         let (mut sum, mut scatter, mut stated) = (0.0, Matrix6::zeros(), Matrix6::zeros());
         for seed in 0..trials {
-            let truth = anywhere(1);
+            let truth = random_pose(1);
             let f = fit(&rig(), &picks(&truth, sigma, seed, &CORNERS[..n]), 20.0).unwrap();
             let e = graspd_rt::geom::log_pose(&(truth.inverse() * f.left_from_mesh));
             sum += (e.transpose() * f.covariance.try_inverse().unwrap() * e)[0];
@@ -86,10 +87,10 @@ fn the_covariance_is_what_the_pose_scatters_by() {
         }
         let mean = sum / trials as f64;
         println!("{n} picks, {sigma} px: mean squared Mahalanobis distance {mean:.2} of 6");
-        // For few picks the distance has a long tail (it is an F with 10 degrees of freedom for 4 of them).
+        // For few picks the distance has a long tail (for 4 picks, an F distribution with 10 degrees of freedom).
         let slack = if n > 4 { 0.1 } else { 0.2 };
         assert!((mean / 6.0 - 1.0).abs() < slack, "{n} picks: {mean}");
-        // Each coordinate by itself is not told surer than it is, nor much less sure.
+        // The variance of each coordinate is not underestimated, and not much overestimated.
         for k in 0..6 {
             let ratio = stated[(k, k)] / scatter[(k, k)];
             assert!(ratio > 0.85 && ratio < 2.0, "{n} picks, coordinate {k}: {ratio}");
@@ -100,7 +101,7 @@ fn the_covariance_is_what_the_pose_scatters_by() {
 #[test]
 fn a_wrong_pick_among_five_is_named() {
     for seed in 0..120 {
-        let truth = anywhere(seed);
+        let truth = random_pose(seed);
         let n = 5 + (seed % 5) as usize;
         let mut p = picks(&truth, 0.5, seed, &CORNERS[..n]);
         let k = seed as usize % n;
@@ -119,7 +120,7 @@ fn a_wrong_pick_among_five_is_named() {
         let mut p = picks(&truth, 0.5, seed, &CORNERS[..n]);
         let q = p[k];
         if (q.left - q.right).norm() < 25.0 {
-            // The cameras look at one point: near it the two pixels are alike.
+            // The optical axes intersect: near that point the two pixels are equal.
             continue;
         }
         (p[k].left, p[k].right) = (q.right, q.left);
@@ -130,9 +131,9 @@ fn a_wrong_pick_among_five_is_named() {
 }
 
 #[test]
-fn what_is_wrong_with_all_picks_is_said() {
+fn errors_common_to_all_picks_are_named() {
     for seed in 0..60 {
-        let truth = anywhere(seed);
+        let truth = random_pose(seed);
         let n = 6 + (seed % 4) as usize;
         let good = picks(&truth, 0.4, seed, &CORNERS[..n]);
         // Two exchanged.
@@ -143,7 +144,7 @@ fn what_is_wrong_with_all_picks_is_said() {
             let e = fit(&rig(), &p, 5.0).unwrap_err();
             assert_eq!(e, PickError::Exchanged(i.min(j) + 1, i.max(j) + 1), "{seed}");
         }
-        // A mirrored mesh, whichever way it is mirrored; a mesh read in the wrong unit.
+        // A mirrored mesh, for any mirror plane; a mesh read in the wrong unit.
         let each =
             |f: &dyn Fn(Vec3) -> Vec3| good.iter().map(|p| Picked { point: f(p.point), ..*p }).collect::<Vec<_>>();
         for mirrored in [each(&|p| Vec3::new(p.x, -p.y, p.z)), each(&|p| -p), each(&|p| Vec3::new(p.y, p.x, p.z))] {
@@ -155,7 +156,7 @@ fn what_is_wrong_with_all_picks_is_said() {
                 other => panic!("{seed}: {other:?}"),
             }
         }
-        // Left and right images exchanged: every pair of rays diverges, or nothing fits.
+        // Left and right images exchanged: all pairs of rays diverge, or nothing fits.
         let turned: Vec<Picked> = good.iter().map(|p| Picked { left: p.right, right: p.left, ..*p }).collect();
         assert!(fit(&rig(), &turned, 5.0).is_err());
         // Two wrong of six or more are both named.
@@ -171,7 +172,7 @@ fn what_is_wrong_with_all_picks_is_said() {
 
 #[test]
 fn too_few_and_collinear_picks_are_refused() {
-    let truth = anywhere(7);
+    let truth = random_pose(7);
     let p = picks(&truth, 0.0, 0, &CORNERS);
     assert_eq!(fit(&rig(), &p[..2], 5.0), Err(PickError::TooFew(2)));
     let line: Vec<[f64; 3]> = (0..7).map(|k| [0.01 * f64::from(k), 0.0, 1e-4 * f64::from(k % 2)]).collect();
@@ -181,7 +182,7 @@ fn too_few_and_collinear_picks_are_refused() {
     let mut nan = p.clone();
     nan[2].left.x = f64::NAN;
     assert!(matches!(fit(&rig(), &nan, 5.0), Err(PickError::Degenerate(_))));
-    // Pixels of nothing at all: no majority, and no panic.
+    // Random pixels: no majority, and no panic.
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(1);
     for _ in 0..200 {
         let mut px = || Pixel::new(rng.random_range(-2e3..4e3), rng.random_range(-2e3..4e3));

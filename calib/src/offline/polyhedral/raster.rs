@@ -1,16 +1,20 @@
-//! The image of a face from straight above, and the outline of what two such images have in common.
+//! Orthographic rasters of faces, and the outline of the overlap of two of them.
 
 use super::faces::Face;
 use super::mesh::Mesh;
 use graspd_rt::geom::Vec3;
 use std::collections::HashMap;
 
-/// Cells along the longer side at least, along the shorter side at least, and along the longer side at most.
-const CELLS: (f64, f64, f64) = (64.0, 16.0, 512.0);
-/// Deviation of an outline from a straight side that is only the staircase of its cells, in cells.
-const STAIR: f64 = 1.2;
+/// Fewest cells along the longer side of a grid.
+const MIN_CELLS_LONG: f64 = 64.0;
+/// Fewest cells along the shorter side of a grid.
+const MIN_CELLS_SHORT: f64 = 16.0;
+/// Most cells along a side of a grid; it takes precedence over the two limits above.
+const MAX_CELLS: f64 = 512.0;
+/// Largest deviation of an outline from a straight side that is due to the cells alone, in cells.
+const MAX_STAIR_CELLS: f64 = 1.2;
 
-/// A grid on a plane.
+/// A raster on a plane.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Grid {
     /// Origin of the axes.
@@ -21,18 +25,19 @@ pub(super) struct Grid {
     pub(super) v: Vec3,
     /// Normal.
     pub(super) n: Vec3,
-    /// Lower corner, metres along the axes.
+    /// Lower corner in the axes of the plane, metres.
     lo: [f64; 2],
     /// Side of a cell, metres.
     pub(super) cell: f64,
+    /// Numbers of cells along u and v.
     size: [usize; 2],
 }
 
-/// Bounds of a face along the axes.
+/// Lower and upper bound of a face in the axes of the plane.
 type Bounds = ([f64; 2], [f64; 2]);
 
 impl Grid {
-    /// A grid over what the bounds of two faces have in common; `None` when that is nothing.
+    /// A grid over the intersection of the bounds of two faces; `None` if it is empty.
     pub(super) fn over(mesh: &Mesh, faces: [&Face; 2], origin: Vec3, [u, v, n]: [Vec3; 3]) -> Option<Self> {
         let bounds = |f: &Face| -> Bounds {
             let (mut lo, mut hi) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
@@ -51,23 +56,25 @@ impl Grid {
             return None;
         }
         let (long, short) = (side[0].max(side[1]), side[0].min(side[1]));
-        let cell = (long / CELLS.0).min(short / CELLS.1).max(long / CELLS.2);
-        let size = side.map(|s| ((s / cell - 1e-6).ceil() as usize).clamp(1, CELLS.2 as usize));
+        let cell = (long / MIN_CELLS_LONG).min(short / MIN_CELLS_SHORT).max(long / MAX_CELLS);
+        let size = side.map(|s| ((s / cell - 1e-6).ceil() as usize).clamp(1, MAX_CELLS as usize));
         Some(Self { origin, u, v, n, lo, cell, size })
     }
 
+    /// Coordinates of a point in the axes of the plane and along its normal.
     fn flat(&self, p: &Vec3) -> [f64; 3] {
         let d = p - self.origin;
         [d.dot(&self.u), d.dot(&self.v), d.dot(&self.n)]
     }
 
-    /// Place of a cell's centre along the axes, metres.
+    /// Centre of a cell in the axes of the plane, metres.
     pub(super) fn at(&self, k: usize) -> [f64; 2] {
         let (x, y) = (k % self.size[0], k / self.size[0]);
         [self.lo[0] + (x as f64 + 0.5) * self.cell, self.lo[1] + (y as f64 + 0.5) * self.cell]
     }
 
-    /// Height of a face over the plane in each cell, the largest by `sign`; NaN where the face is not. Specks of missing triangles are filled.
+    /// Height of a face over the plane in each cell, metres; the largest where it is ambiguous, the smallest for a
+    /// negative `sign`. NaN where there is no face. Small holes are filled.
     pub(super) fn heights(&self, mesh: &Mesh, f: &Face, sign: f64) -> Vec<f64> {
         let [w, h] = self.size;
         let mut out = vec![f64::NAN; w * h];
@@ -83,14 +90,14 @@ impl Grid {
             let turn = |s: &[f64; 3], e: &[f64; 3], q: &[f64; 2]| {
                 (e[0] - s[0]) * (q[1] - s[1]) - (e[1] - s[1]) * (q[0] - s[0])
             };
-            let whole = turn(&p[0], &p[1], &[p[2][0], p[2][1]]);
-            if whole.abs() < 1e-18 {
+            let area = turn(&p[0], &p[1], &[p[2][0], p[2][1]]);
+            if area.abs() < 1e-18 {
                 continue;
             }
             for y in y0..y1 {
                 for x in x0..x1 {
                     let q = [self.lo[0] + (x as f64 + 0.5) * self.cell, self.lo[1] + (y as f64 + 0.5) * self.cell];
-                    let d = [turn(&p[1], &p[2], &q), turn(&p[2], &p[0], &q), turn(&p[0], &p[1], &q)].map(|d| d / whole);
+                    let d = [turn(&p[1], &p[2], &q), turn(&p[2], &p[0], &q), turn(&p[0], &p[1], &q)].map(|d| d / area);
                     if d.iter().all(|v| *v >= -1e-9) {
                         let z = d[0] * p[0][2] + d[1] * p[1][2] + d[2] * p[2][2];
                         if let Some(c) = out.get_mut(y * w + x) {
@@ -100,9 +107,15 @@ impl Grid {
                 }
             }
         }
+        self.fill_holes(&mut out);
+        out
+    }
+
+    /// Fills cells without a height that have at least six neighbours with one, twice.
+    fn fill_holes(&self, heights: &mut [f64]) {
         for _ in 0..2 {
-            let before = out.clone();
-            for (k, c) in out.iter_mut().enumerate().filter(|(_, c)| c.is_nan()) {
+            let before = heights.to_vec();
+            for (k, c) in heights.iter_mut().enumerate().filter(|(_, c)| c.is_nan()) {
                 let near: Vec<f64> =
                     self.around(k).filter_map(|i| before.get(i).copied()).filter(|z| !z.is_nan()).collect();
                 if near.len() >= 6 {
@@ -110,10 +123,9 @@ impl Grid {
                 }
             }
         }
-        out
     }
 
-    /// The cells round one.
+    /// The eight neighbours of a cell.
     fn around(&self, k: usize) -> impl Iterator<Item = usize> + '_ {
         let [w, h] = self.size.map(|s| s as i64);
         let (x, y) = (k as i64 % w, k as i64 / w);
@@ -123,7 +135,7 @@ impl Grid {
             .filter_map(move |(x, y)| (x >= 0 && y >= 0 && x < w && y < h).then_some((y * w + x) as usize))
     }
 
-    /// The connected parts of a set of cells.
+    /// The connected components (8-neighbourhood) of a set of cells.
     pub(super) fn parts(&self, set: &[bool]) -> Vec<Vec<usize>> {
         let mut left = set.to_vec();
         let mut out = Vec::new();
@@ -151,13 +163,14 @@ impl Grid {
         out
     }
 
-    /// The sides of a part's outer outline: its two ends, metres along the axes, with the inside to the left. What deviates from a straight side by
-    /// less than `ragged` (metres) is no corner.
+    /// The sides of the outer outline of a component: the two ends of each in the axes of the plane, metres, with the
+    /// inside to the left. A deviation from a straight side of less than `ragged` (metres) is not a corner
+    /// (Douglas-Peucker).
     pub(super) fn sides(&self, part: &[usize], ragged: f64) -> Vec<[[f64; 2]; 2]> {
-        let stair = STAIR.max(ragged / self.cell);
+        let stair = MAX_STAIR_CELLS.max(ragged / self.cell);
         let outline = self.outline(part);
         let n = outline.len();
-        // The two corners farthest from each other lie on the simplified outline in any case.
+        // The simplification starts from two corners that are far from each other.
         let far = |from: usize| {
             let d = |k: &usize| match (outline.get(*k), outline.get(from)) {
                 (Some(a), Some(b)) => (a[0] - b[0]).pow(2) + (a[1] - b[1]).pow(2),
@@ -191,7 +204,8 @@ impl Grid {
         (0..m).map(ends).filter(|(a, b)| b > a).map(|(a, b)| self.straight(a, b, &at).map(metres)).collect()
     }
 
-    /// The straight line through a piece of the outline, without the staircase: by its middle points, as long as the piece.
+    /// A least-squares line through the middle part of a piece of the outline, which averages the steps of the cells.
+    /// It is as long as the piece.
     fn straight(&self, a: usize, b: usize, at: &dyn Fn(usize) -> [f64; 2]) -> [[f64; 2]; 2] {
         let (p, q) = (at(a), at(b));
         let trim = (b - a) / 8;
@@ -216,20 +230,20 @@ impl Grid {
         [[c[0] - d[0], c[1] - d[1]], [c[0] + d[0], c[1] + d[1]]]
     }
 
-    /// Corners of the cells along a part's outer outline, in cells, the inside to the left.
+    /// Corners of the cells along the outer outline of a component, in cells, with the inside to the left.
     fn outline(&self, part: &[usize]) -> Vec<[i64; 2]> {
         let w = self.size[0] as i64;
         let set: std::collections::HashSet<[i64; 2]> = part.iter().map(|k| [*k as i64 % w, *k as i64 / w]).collect();
-        // The first cell of the lowest row: its lower side belongs to the outer outline.
+        // Start at the first cell of the lowest row, whose lower side belongs to the outer outline.
         let Some(first) = part.first().map(|k| [*k as i64 % w, *k as i64 / w]) else { return Vec::new() };
-        let way = [[1, 0], [0, 1], [-1, 0], [0, -1]];
+        let steps = [[1, 0], [0, 1], [-1, 0], [0, -1]];
         let (mut at, mut d) = (first, 0usize);
         let mut out = Vec::new();
         loop {
             out.push(at);
-            let [x, y] = [at[0] + way[d][0], at[1] + way[d][1]];
+            let [x, y] = [at[0] + steps[d][0], at[1] + steps[d][1]];
             at = [x, y];
-            // The two cells ahead of the corner, left and right of the way.
+            // The two cells ahead of the corner, left and right of the direction of travel.
             let (left, right) = match d {
                 0 => ([x, y], [x, y - 1]),
                 1 => ([x - 1, y], [x, y]),
@@ -248,8 +262,8 @@ impl Grid {
     }
 }
 
-/// Edges of a face that it shares with none of its own triangles, as vectors.
-pub(super) fn rim(mesh: &Mesh, f: &Face) -> Vec<Vec3> {
+/// The boundary edges of a face, as vectors: those with only one of its triangles.
+pub(super) fn boundary(mesh: &Mesh, f: &Face) -> Vec<Vec3> {
     let mut seen: HashMap<(u32, u32), u32> = HashMap::new();
     for [a, b, c] in f.triangles.iter().filter_map(|t| mesh.triangles.get(*t as usize)) {
         for (p, q) in [(*a, *b), (*b, *c), (*c, *a)] {
@@ -280,7 +294,7 @@ mod tests {
         let part = |inside: &dyn Fn(f64, f64) -> bool| -> Vec<usize> {
             (0..6400).filter(|k| inside(grid.at(*k)[0], grid.at(*k)[1])).collect()
         };
-        // A rectangle, a bar three cells wide, an L (with its hollow corner), a square turned by 30 degrees.
+        // A rectangle, a bar three cells wide, an L with its concave corner, a square rotated by 30 degrees.
         assert_eq!(grid.sides(&part(&|x, y| x > 5.0 && x < 60.0 && y > 7.0 && y < 30.0), 0.0).len(), 4);
         assert_eq!(grid.sides(&part(&|x, y| x > 5.0 && x < 60.0 && y > 7.0 && y < 10.0), 0.0).len(), 4);
         assert_eq!(grid.sides(&part(&|x, y| x < 20.0 || y < 20.0), 0.0).len(), 6);
@@ -298,7 +312,7 @@ mod tests {
             let off = (dy.atan2(dx).to_degrees() - 30.0).rem_euclid(90.0);
             assert!(off.min(90.0 - off) < 1.0 && (dx.hypot(dy) - 40.0).abs() < 2.0, "{off} {}", dx.hypot(dy));
         }
-        // Two squares that touch at a corner are one part, two apart are two.
+        // Two squares that touch at a corner are one component, a third one is another.
         let set: Vec<bool> = (0..6400)
             .map(|k| {
                 let [x, y] = grid.at(k);

@@ -1,48 +1,36 @@
-//! A mesh file: its triangles in metres, and what a careful reader has to say about them.
+//! Mesh files: STL or OBJ in, a consistently oriented mesh in metres out, with notes on the defects of the file.
 
 use super::mesh::Mesh;
+use super::problem::Problem;
 use super::topology::{self, Topology};
 use super::{obj, stl};
 use crate::files::{ContentHash, FileError};
 use graspd_rt::geom::Vec3;
 use std::path::Path;
 
-/// Most triangles that are read.
-const MOST: usize = 4_000_000;
-/// Largest file, bytes.
-const MOST_BYTES: u64 = 1 << 30;
-/// Smallest and largest part, metres: outside it the unit is wrong.
-const SIZE: std::ops::RangeInclusive<f64> = 1e-3..=20.0;
+/// Most triangles of a mesh.
+const MAX_TRIANGLES: usize = 4_000_000;
+/// Largest mesh file, bytes.
+const MAX_BYTES: u64 = 1 << 30;
+/// Range of the diagonal of a part's bounding box, metres: outside it the unit is wrong.
+const SIZE_M: std::ops::RangeInclusive<f64> = 1e-3..=20.0;
 
-/// What is wrong with a file's content, where, and what to do.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) struct Problem {
-    reason: String,
-    fix: String,
-}
-
-impl Problem {
-    pub(super) fn new(reason: impl Into<String>, fix: impl Into<String>) -> Self {
-        Self { reason: reason.into(), fix: fix.into() }
-    }
-}
-
-/// A mesh as it stands in a file.
+/// The content of a mesh file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MeshFile {
-    /// The mesh, metres, with its triangles turned outwards.
+    /// The mesh, metres, with all triangles counter-clockwise seen from outside.
     pub mesh: Mesh,
     /// SHA-256 of the file's bytes.
     pub hash: ContentHash,
-    /// Length of the file's unit, metres.
+    /// Length of the unit of the file, metres.
     pub unit_m: f64,
-    /// Edges of the bounding box, metres.
+    /// Size of the bounding box, metres.
     pub size: Vec3,
-    /// What the operator should know about it.
+    /// Notes for the operator on defects of the file.
     pub notes: Vec<String>,
 }
 
-/// The length of a named unit in metres.
+/// Length of a unit ("mm", "cm", "m", "inch" or "in"), metres.
 pub fn unit(name: &str) -> Option<f64> {
     match name.to_ascii_lowercase().as_str() {
         "mm" => Some(1e-3),
@@ -53,18 +41,18 @@ pub fn unit(name: &str) -> Option<f64> {
     }
 }
 
-/// Reads an STL (binary or text) or OBJ file. Neither says in which unit it is; `unit_m` is the length of one in metres.
+/// Reads an STL (binary or text) or OBJ file. Neither format states a unit; `unit_m` is its length in metres.
 ///
 /// # Errors
-/// The file, the byte or line, what is wrong there, and what to do.
+/// Names the file, the byte or line, the problem and the fix.
 pub fn load(path: &Path, unit_m: f64) -> Result<MeshFile, FileError> {
     let name = path.display().to_string();
     let refuse = |reason: String, fix: &str| FileError::Read { path: name.clone(), reason, fix: fix.to_owned() };
     let meta = std::fs::metadata(path).map_err(|e| refuse(e.to_string(), "check the path"))?;
     if !meta.is_file() {
-        return Err(refuse("it is not a regular file".to_owned(), "name an STL or OBJ file"));
+        return Err(refuse("it is not a regular file".to_owned(), "give an STL or OBJ file"));
     }
-    if meta.len() > MOST_BYTES {
+    if meta.len() > MAX_BYTES {
         return Err(refuse(
             format!("it has {} bytes", meta.len()),
             "reduce the mesh to less than four million triangles",
@@ -75,7 +63,7 @@ pub fn load(path: &Path, unit_m: f64) -> Result<MeshFile, FileError> {
     parse(&bytes, kind.as_deref().unwrap_or(""), unit_m).map_err(|p| refuse(p.reason, &p.fix))
 }
 
-/// Reads the bytes of a mesh file of a kind ("stl" or "obj").
+/// Parses the bytes of a mesh file of the given kind, "stl" or "obj".
 fn parse(bytes: &[u8], kind: &str, unit_m: f64) -> Result<MeshFile, Problem> {
     let again = "export the part again as STL or OBJ";
     if bytes.is_empty() {
@@ -84,49 +72,49 @@ fn parse(bytes: &[u8], kind: &str, unit_m: f64) -> Result<MeshFile, Problem> {
     let corners = match kind {
         "stl" => stl::read(bytes)?,
         "obj" => obj::read(bytes)?,
-        _ => return Err(Problem::new("its name ends neither in .stl nor in .obj", again)),
+        _ => return Err(Problem::new("the file name ends neither in .stl nor in .obj", again)),
     };
     let count = corners.len();
     if count == 0 {
-        return Err(Problem::new("it holds no triangle", again));
+        return Err(Problem::new("it has no triangle", again));
     }
-    if count > MOST {
+    if count > MAX_TRIANGLES {
         return Err(Problem::new(format!("it has {count} triangles"), "reduce the mesh to less than four million"));
     }
     let mesh = Mesh::from_corners(corners.iter().map(|t| t.map(|v| v * unit_m)));
-    let mut mesh = mesh.ok_or_else(|| Problem::new("none of its triangles has an area", again))?;
+    let mut mesh = mesh.ok_or_else(|| Problem::new("all of its triangles are degenerate: none has an area", again))?;
     let size = mesh.size();
-    if !SIZE.contains(&size.norm()) {
+    if !SIZE_M.contains(&size.norm()) {
         return Err(Problem::new(
-            format!("the part would be {:.4} x {:.4} x {:.4} m large", size.x, size.y, size.z),
+            format!("the part would have a size of {:.4} x {:.4} x {:.4} m", size.x, size.y, size.z),
             "give the unit of the file with --mesh-unit (mm, cm, m, inch)",
         ));
     }
     let mut notes = Vec::new();
     let flat = count - mesh.triangles.len();
     if flat > 0 {
-        notes.push(format!("{flat} of {count} triangles have no area, or are given twice, and were left out"));
+        notes.push(format!("{flat} of {count} triangles are degenerate or duplicate and were left out"));
     }
-    let Topology { turned, inside_out, open, crowded, one_sided, .. } = topology::mend(&mut mesh);
+    let Topology { turned, inside_out, open, crowded, one_sided, .. } = topology::orient(&mut mesh);
     if inside_out {
-        notes.push("every normal of the mesh pointed inwards; they were turned".to_owned());
+        notes.push("all normals of the mesh pointed inwards and were reversed".to_owned());
     }
     if turned > 0 {
-        notes.push(format!("{turned} triangles were wound against their neighbours and were turned"));
+        notes.push(format!("{turned} triangles were wound against their neighbours and were reversed"));
     }
     if open > 0 {
         notes.push(format!(
-            "the mesh has {open} open edges: what stands behind a hole in it is not known to the collision check"
+            "the mesh has {open} open edges: the collision test knows nothing of the surface that is missing there"
         ));
     }
     if crowded > 0 {
         notes.push(format!(
-            "{crowded} edges join more than two triangles: the mesh is not the surface of one solid there"
+            "{crowded} edges join more than two triangles: the mesh is not the surface of a solid there"
         ));
     }
     if one_sided > 0 {
         notes.push(format!(
-            "{one_sided} edges join triangles that cannot be wound alike: inside and outside are not certain there"
+            "{one_sided} edges join triangles that cannot be oriented consistently: inside and outside are ambiguous there"
         ));
     }
     Ok(MeshFile { mesh, hash: ContentHash::of(bytes), unit_m, size, notes })

@@ -1,4 +1,4 @@
-//! Mesh files as they come: right ones in every dialect, and every way of being broken.
+//! Mesh files: valid ones in every dialect, and every kind of damage.
 
 use super::*;
 use std::fmt::Write as _;
@@ -12,7 +12,7 @@ fn cube() -> Corners {
 }
 
 fn binary(t: &Corners) -> Vec<u8> {
-    // Many exporters begin a binary file with the word that marks a text.
+    // Many exporters begin a binary file with the keyword of a text file.
     let mut out = b"solid of somebody's exporter".to_vec();
     out.resize(80, b' ');
     out.extend((t.len() as u32).to_le_bytes());
@@ -70,7 +70,7 @@ fn every_dialect_gives_the_same_cube_and_agrees_with_other_readers() {
 }
 
 #[test]
-fn broken_files_are_refused_with_place_and_reason() {
+fn damaged_files_are_refused_with_position_and_reason() {
     let whole = binary(&cube());
     let with = |at: usize, bytes: &[u8]| {
         let mut b = whole.clone();
@@ -81,7 +81,7 @@ fn broken_files_are_refused_with_place_and_reason() {
     let cases: Vec<(Vec<u8>, &str, &str)> = vec![
         (vec![], "stl", "it is empty"),
         (whole[..40].to_vec(), "stl", "byte 40"),
-        (whole[..whole.len() - 1].to_vec(), "stl", "byte 683: it ends there, but the 12 triangles"),
+        (whole[..whole.len() - 1].to_vec(), "stl", "byte 683: the file ends there, but the 12 triangles"),
         (with(80, &3u32.to_le_bytes()), "stl", "byte 234: 450 more bytes"),
         (with(80, &u32::MAX.to_le_bytes()), "stl", "4294967295 triangles"),
         (with(84 + 50 + 12, &f32::NAN.to_le_bytes()), "stl", "byte 134: triangle 1"),
@@ -106,12 +106,12 @@ fn broken_files_are_refused_with_place_and_reason() {
         (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -9\n".to_vec(), "obj", "vertex -9"),
         (b"v 0 0 0\nv 1 0 0\nf 1 2\n".to_vec(), "obj", "line 3: a face has 2 corners"),
         (b"v 0 0 0\nf a b c\n".to_vec(), "obj", "line 2"),
-        (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 \\\n".to_vec(), "obj", "line 4: it ends inside"),
+        (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 \\\n".to_vec(), "obj", "line 4: the file ends inside"),
         (whole.clone(), "step", "neither in .stl nor in .obj"),
     ];
-    for (bytes, kind, words) in cases {
+    for (bytes, kind, message) in cases {
         let e = parse(&bytes, kind, 1e-3).unwrap_err();
-        assert!(e.reason.contains(words), "{words}: {e:?}");
+        assert!(e.reason.contains(message), "{message}: {e:?}");
         assert!(!e.fix.is_empty());
     }
     for (unit_m, large) in [(1.0, "40.0000"), (1e-6, "0.0000")] {
@@ -142,13 +142,13 @@ fn cut_and_altered_files_never_panic() {
 }
 
 #[test]
-fn windings_are_mended_and_doubts_are_told() {
+fn windings_are_corrected_and_defects_are_noted() {
     let flip = |t: &mut [[f32; 3]; 3]| t.swap(1, 2);
     let good = parse(&binary(&cube()), "stl", 1e-3).unwrap();
     let mut some = cube();
     some.iter_mut().step_by(4).for_each(flip);
-    let mended = parse(&binary(&some), "stl", 1e-3).unwrap();
-    assert!(mended.notes.iter().any(|n| n.contains("3 triangles were wound against")), "{:?}", mended.notes);
+    let corrected = parse(&binary(&some), "stl", 1e-3).unwrap();
+    assert!(corrected.notes.iter().any(|n| n.contains("3 triangles were wound against")), "{:?}", corrected.notes);
     let mut all = cube();
     all.iter_mut().for_each(flip);
     let turned = parse(&binary(&all), "stl", 1e-3).unwrap();
@@ -159,10 +159,10 @@ fn windings_are_mended_and_doubts_are_told() {
             (b - a).cross(&(c - a)).dot(&a) > 0.0
         })
     };
-    assert!(outward(&good.mesh) && outward(&mended.mesh) && outward(&turned.mesh));
+    assert!(outward(&good.mesh) && outward(&corrected.mesh) && outward(&turned.mesh));
     let open = parse(&binary(&cube()[..10].to_vec()), "stl", 1e-3).unwrap();
     assert!(open.notes.iter().any(|n| n.contains("4 open edges")), "{:?}", open.notes);
-    // A triangle given twice, one without area, and a fin that stands on an edge.
+    // A duplicate triangle, a degenerate one, and a fin on an edge.
     let mut double = cube();
     double.push(cube()[0]);
     double.push([[5.0; 3]; 3]);
@@ -175,8 +175,8 @@ fn windings_are_mended_and_doubts_are_told() {
 }
 
 #[test]
-fn hollow_polygons_are_cut_within_their_outline() {
-    // An L of area 3, given from every corner in turn.
+fn concave_polygons_are_triangulated_within_their_outline() {
+    // An L-shaped polygon of area 3, starting at each of its corners.
     let l = [[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]];
     for from in 0..6 {
         let mut obj = String::new();
@@ -195,7 +195,7 @@ fn hollow_polygons_are_cut_within_their_outline() {
 }
 
 #[test]
-fn pieces_and_hollows_are_turned_each_for_itself() {
+fn components_and_cavities_are_oriented_separately() {
     let at = |t: Corners, s: f32, d: f32| -> Corners {
         t.iter().map(|t| t.map(|v| [v[0] * s + d, v[1] * s, v[2] * s])).collect()
     };
@@ -204,14 +204,16 @@ fn pieces_and_hollows_are_turned_each_for_itself() {
         let m = parse(&binary(t), "stl", 1e-3).unwrap().mesh;
         (0..m.triangles.len()).map(|t| m.corners(t)).map(|[a, b, c]| a.dot(&b.cross(&c)) / 6.0 * 1e6).sum::<f64>()
     };
-    // Two cubes of 64 and 8 cm3 side by side, one of them inside out: both count. A hollow of 8 cm3 is taken off, whichever way all of it is wound.
+    // Two separate cubes of 64 and 8 cm3, one of them inside out: their volumes add. A cavity of 8 cm3 is subtracted,
+    // for either orientation of the whole mesh.
     let (large, small) = (at(cube(), 1.0, 0.0), at(cube(), 0.5, 60.0));
     for t in [[large.clone(), flip(small.clone())].concat(), [flip(large.clone()), small].concat()] {
         assert!((volume(&t) - 72.0).abs() < 1e-3, "{}", volume(&t));
     }
     let hollow = [large, flip(at(cube(), 0.5, 0.0))].concat();
     assert!((volume(&hollow) - 56.0).abs() < 1e-3 && (volume(&flip(hollow)) - 56.0).abs() < 1e-3);
-    // Six faces that share no corner (each a thousandth of a millimetre from the next), every second one wound inwards: still a cube.
+    // Six faces that share no corner (each a few micrometres from the next), every second one wound inwards: still a
+    // cube.
     let mut loose = cube();
     for (k, t) in loose.iter_mut().enumerate() {
         *t = t.map(|v| v.map(|x| x * (1.0 + 1e-4 * (k / 2) as f32)));

@@ -1,21 +1,23 @@
-//! The one-page report of a plan on a mesh: image, pose with its doubt, what the picks say, the ellipses of uncertainty, every handle. One file.
+//! The report of a plan on a mesh, one HTML page without external resources: overlay, pose, residuals of the picks,
+//! uncertainty, handles.
 
-use super::filter::Judged;
+use super::filter::Assessed;
 use super::plan::{MeshPlan, Placed, Survey};
 use super::pose::{Picked, residuals};
 use crate::files::RigFile;
-use crate::offline::drawing::report::{Cross, centre_plot, escape, head, normal_plot, row};
+use crate::offline::drawing::page::{escape, head, path_row, row, uncertainty, visibility_cells};
+use crate::offline::drawing::plots::Cross;
 use graspd_rt::geom::{Pixel, Vec3};
 use nalgebra::{Matrix2, Matrix3};
-use std::fmt::Write;
+use std::fmt::Write as _;
 
-/// Handles listed at most; a scan of a round part has thousands.
-const MOST_ROWS: usize = 400;
+/// Most handles in the table; a scan of a round part has thousands.
+const MAX_ROWS: usize = 400;
 
-/// The report as HTML; `image` is the overlay's PNG.
+/// The report as HTML; `image` is the overlay's PNG file.
 pub fn html(plan: &MeshPlan, survey: &Survey<'_>, placed: &Placed, rig: &RigFile, image: Option<&[u8]>) -> String {
     let o = &plan.file.object;
-    let image = image.map(|png| (png, "both views with the part's edges, the way in, gripper and marks"));
+    let image = image.map(|png| (png, "both views with the edges of the part, the approach, gripper and marks"));
     let mut h = head("Grasp on a mesh", plan.set_point.id, &plan.file.warnings, image);
     h += "<div class=two><div><h2>Part</h2><table>";
     part(&mut h, placed);
@@ -23,23 +25,24 @@ pub fn html(plan: &MeshPlan, survey: &Survey<'_>, placed: &Placed, rig: &RigFile
     handle(&mut h, plan);
     h += "</table></div></div>";
     picks(&mut h, placed, rig);
-    h += "<h2>Uncertainty</h2><small>of the grasp's place and of the approach, from the pose of the part; ellipses that hold the truth with 95 % probability</small><div class=two>";
-    if placed.covariance.is_some() {
-        let centre = Matrix3::from_fn(|i, j| o.covariance_centre_m2[i][j]);
-        let normal = Matrix2::from_fn(|i, j| o.covariance_normal_rad2[i][j]);
-        let _ = write!(h, "<div>{}</div><div>{}</div></div>", centre_plot(&centre), normal_plot(&normal));
-    } else {
-        h += "<div>not known: the pose file states no sigma_mm and sigma_deg</div></div>";
-    }
+    let covariance = (
+        Matrix3::from_fn(|i, j| o.covariance_centre_m2[i][j]),
+        Matrix2::from_fn(|i, j| o.covariance_normal_rad2[i][j]),
+    );
+    uncertainty(
+        &mut h,
+        "95 % ellipses of the grasp position and the approach, from the pose of the part",
+        placed.covariance.map(|_| covariance).ok_or("unknown: the pose file has neither sigma_mm nor sigma_deg"),
+    );
     handles(&mut h, plan, survey);
     h += "</html>\n";
     h
 }
 
 fn vector(v: &Vec3, scale: f64, digits: usize) -> String {
-    // No minus before a nought that is only rounding error.
-    let least = 0.5 * 10f64.powi(-(digits as i32));
-    let number = |x: &f64| if (x * scale).abs() < least { 0.0 } else { x * scale };
+    // Rounding errors must not print as -0.0.
+    let half_digit = 0.5 * 10f64.powi(-(digits as i32));
+    let number = |x: &f64| if (x * scale).abs() < half_digit { 0.0 } else { x * scale };
     v.iter().map(|x| format!("{:.digits$}", number(x))).collect::<Vec<_>>().join(", ")
 }
 
@@ -49,7 +52,7 @@ fn part(h: &mut String, placed: &Placed) {
     row(h, "size", &format!("{} mm, {} triangles", vector(&Vec3::from(m.size_m), 1e3, 1), m.triangles));
     row(h, "unit of the file", &format!("{} mm", m.unit_m * 1e3));
     row(h, "file", &format!("<code>{}</code>", escape(m.hash.get(..16).unwrap_or(&m.hash))));
-    row(h, "place (left camera)", &format!("{} mm", vector(&pose.translation.vector, 1e3, 2)));
+    row(h, "position (left camera)", &format!("{} mm", vector(&pose.translation.vector, 1e3, 2)));
     row(
         h,
         "rotation vector",
@@ -57,12 +60,16 @@ fn part(h: &mut String, placed: &Placed) {
     );
     if let Some(c) = &placed.covariance {
         let sd = |k: usize| c[(k, k)].max(0.0).sqrt();
-        let place = Vec3::new(sd(0), sd(1), sd(2));
+        let position = Vec3::new(sd(0), sd(1), sd(2));
         let turn = Vec3::new(sd(3), sd(4), sd(5)) * (180.0 / std::f64::consts::PI);
         row(
             h,
-            "its standard deviations",
-            &format!("{} mm; {}&deg;, along and about the mesh's axes", vector(&place, 1e3, 2), vector(&turn, 1.0, 3)),
+            "standard deviations",
+            &format!(
+                "{} mm; {}&deg;, along and about the axes of the mesh",
+                vector(&position, 1e3, 2),
+                vector(&turn, 1.0, 3)
+            ),
         );
     }
     let from = match m.rms_px {
@@ -74,8 +81,12 @@ fn part(h: &mut String, placed: &Placed) {
 
 fn handle(h: &mut String, plan: &MeshPlan) {
     let (o, j) = (&plan.file.object, &plan.chosen);
-    row(h, "width", &format!("{:.2} mm, jaws {:.2} mm open on the way in", j.handle.width * 1e3, j.opening * 1e3));
-    row(h, "contact", &format!("{:.0} mm&sup2; a claw", j.contact * 1e6));
+    row(
+        h,
+        "width",
+        &format!("{:.2} mm, jaws {:.2} mm open during the approach", j.handle.width * 1e3, j.opening * 1e3),
+    );
+    row(h, "contact", &format!("{:.0} mm&sup2; per claw", j.contact * 1e6));
     row(
         h,
         "closing, approach (mesh)",
@@ -84,14 +95,14 @@ fn handle(h: &mut String, plan: &MeshPlan) {
     row(h, "grasp (left camera)", &format!("{} mm", vector(&Vec3::from(o.centre_m), 1e3, 2)));
     row(
         h,
-        "its uncertainty (worst)",
+        "uncertainty (worst axis)",
         &format!("{:.2} mm, approach {:.2}&deg; (one &sigma;)", o.sigma_centre_mm, o.sigma_normal_deg),
     );
     row(
         h,
         "marks",
         &format!(
-            "{} seen left, {} right ({:.1}, {:.1} &micro;sr), best view {}",
+            "{} visible left, {} right ({:.1}, {:.1} &micro;sr), best view {}",
             j.seen[0],
             j.seen[1],
             j.visibility[0] * 1e6,
@@ -99,22 +110,10 @@ fn handle(h: &mut String, plan: &MeshPlan) {
             escape(&plan.file.best_view)
         ),
     );
-    if let Some(p) = &plan.file.path {
-        row(
-            h,
-            "path",
-            &format!(
-                "{:.0} mm, turn {:.0}&deg;; fewest marks seen {} left, {} right",
-                p.length_m * 1e3,
-                p.turn_deg,
-                p.fewest_marks[0],
-                p.fewest_marks[1]
-            ),
-        );
-    }
+    path_row(h, plan.file.path.as_ref());
 }
 
-/// What the picked pixels differ by from where the pose puts their points: a plot a view, and a table.
+/// The residuals of the picked points: a plot for each view, and a table.
 fn picks(h: &mut String, placed: &Placed, rig: &RigFile) {
     let m = &placed.record;
     let Some(rms) = m.rms_px else { return };
@@ -127,16 +126,18 @@ fn picks(h: &mut String, placed: &Placed, rig: &RigFile) {
             residuals(&rig.rig, &placed.left_from_mesh, &p)
         })
         .collect();
-    h.push_str("<h2>Picked points</h2><small>picked pixel less where the pose puts the point, pixels; the circle is the rms of a pick</small><div class=two>");
+    h.push_str("<h2>Picked points</h2><small>picked pixel minus projected point, pixels; the circle is the rms</small><div class=two>");
     for (k, name) in ["left", "right"].iter().enumerate() {
         let points: Vec<(usize, Pixel)> =
             off.iter().enumerate().filter_map(|(n, o)| o.get(k).copied().flatten().map(|p| (n + 1, p))).collect();
         let _ = write!(h, "<div>{}</div>", scatter(name, &points, rms));
     }
-    h.push_str("</div><table><tr><th>pick<th>point on the mesh, mm<th>left, px<th>off<th>right, px<th>off</tr>");
+    h.push_str(
+        "</div><table><tr><th>pick<th>point on the mesh, mm<th>left, px<th>residual<th>right, px<th>residual</tr>",
+    );
     for (n, (p, o)) in m.picked.iter().zip(&off).enumerate() {
         let px = |p: &[f64; 2]| format!("{:.1}, {:.1}", p[0], p[1]);
-        let by = |o: &Option<Pixel>| o.map_or("behind".to_owned(), |o| format!("{:+.2}, {:+.2}", o.x, o.y));
+        let by = |o: &Option<Pixel>| o.map_or("behind the camera".to_owned(), |o| format!("{:+.2}, {:+.2}", o.x, o.y));
         let _ = write!(
             h,
             "<tr><td>{}<td>{}<td>{}<td>{}<td>{}<td>{}</tr>",
@@ -151,7 +152,7 @@ fn picks(h: &mut String, placed: &Placed, rig: &RigFile) {
     h.push_str("</table>");
 }
 
-/// Differences in pixels as numbered dots round a cross; down is down as in the image.
+/// Residuals in pixels as numbered dots; axes as in the image, v down.
 fn scatter(name: &str, points: &[(usize, Pixel)], rms: f64) -> String {
     let largest = points.iter().map(|(_, p)| p.x.abs().max(p.y.abs())).fold(1.2 * rms, f64::max).max(0.02) * 1.15;
     let Cross { svg: mut s, scale, middle: [cx, cy] } =
@@ -170,23 +171,23 @@ fn scatter(name: &str, points: &[(usize, Pixel)], rms: f64) -> String {
     s
 }
 
-/// Every handle with its verdict, and how many were dropped for which kind of reason.
+/// All handles with their verdicts, and the number of handles for each kind of reason.
 fn handles(h: &mut String, plan: &MeshPlan, survey: &Survey<'_>) {
     let all = &survey.handles;
     let mut kinds = std::collections::BTreeMap::<&str, usize>::new();
     for j in all {
-        *kinds.entry(j.reason.as_ref().map_or("can be taken", |r| r.kind())).or_default() += 1;
+        *kinds.entry(j.reason.as_ref().map_or("possible", |r| r.kind())).or_default() += 1;
     }
     let counts = kinds.iter().map(|(k, n)| format!("{n} {k}")).collect::<Vec<_>>().join(", ");
     let _ = write!(
         h,
-        "<h2>Handles</h2><small>{} on {} flat faces, best first: {counts}; closing and approach in the mesh's frame</small>\
-         <table><tr><th>N<th>width<th>closing<th>approach<th>contact<th>marks left, right<th>visibility<th>verdict</tr>",
+        "<h2>Handles</h2><small>{} on {} flat faces, best first: {counts}; closing and approach in the mesh frame</small>\
+         <table><tr><th>N<th>width<th>closing<th>approach<th>contact<th>visibility left, right<th>marks<th>verdict</tr>",
         all.len(),
         survey.faces
     );
-    let chosen = |j: &Judged| j == &plan.chosen;
-    for (k, j) in all.iter().enumerate().take(MOST_ROWS) {
+    let chosen = |j: &Assessed| j == &plan.chosen;
+    for (k, j) in all.iter().enumerate().take(MAX_ROWS) {
         let (open, close) = if chosen(j) { ("<b>", "</b>") } else { ("", "") };
         let verdict = match &j.reason {
             None if chosen(j) => "chosen".to_owned(),
@@ -195,21 +196,18 @@ fn handles(h: &mut String, plan: &MeshPlan, survey: &Survey<'_>) {
         };
         let _ = write!(
             h,
-            "<tr><td>{open}{}{close}<td>{:.1} mm<td>{}<td>{}<td>{:.0} mm&sup2;<td>{}, {}<td>{:.1}, {:.1} &micro;sr<td>{open}{}{close}</tr>",
+            "<tr><td>{open}{}{close}<td>{:.1} mm<td>{}<td>{}<td>{:.0} mm&sup2;{}<td>{open}{}{close}</tr>",
             k + 1,
             j.handle.width * 1e3,
             vector(&j.handle.closing, 1.0, 2),
             vector(&j.handle.approach, 1.0, 2),
             j.contact * 1e6,
-            j.seen[0],
-            j.seen[1],
-            j.visibility[0] * 1e6,
-            j.visibility[1] * 1e6,
+            visibility_cells(j.visibility.map(|v| v * 1e6), j.seen),
             escape(&verdict)
         );
     }
     h.push_str("</table>");
-    if all.len() > MOST_ROWS {
-        let _ = write!(h, "<small>{} more are not shown; --list shows all</small>", all.len() - MOST_ROWS);
+    if all.len() > MAX_ROWS {
+        let _ = write!(h, "<small>{} more are not shown; --list shows all</small>", all.len() - MAX_ROWS);
     }
 }

@@ -1,19 +1,28 @@
-//! A scan's noise: how large it is, and normals without it.
+//! The noise of a scan: its magnitude, and smoothed normals.
 
 use super::links::Links;
 use super::mesh::Mesh;
 use graspd_rt::geom::Vec3;
 
-/// A mesh is crumpled when more than the rest of this part of its triangles differs from every neighbour by more than this angle: 2 degrees.
-const CRUMPLED: (f64, f64) = (0.035, 0.85);
-/// Rounds of averaging for a mesh whose neighbours agree, and for a crumpled one.
+/// A mesh is noisy if this quantile of the angle between a triangle and its most similar neighbour ...
+const NOISY_QUANTILE: f64 = 0.85;
+/// ... exceeds this angle, radians (2 degrees).
+const NOISY_ANGLE: f64 = 0.035;
+/// Rounds of averaging the normals of a clean mesh and of a noisy one.
 const ROUNDS: [usize; 2] = [2, 24];
 
-/// Noise, in lengths of an edge, up to which averaging normals is enough, and rounds of moving vertices for what is beyond it.
-const RELAX: (f64, f64, f64) = (0.1, 40.0, 10.0);
+/// Noise, as a fraction of the median edge length, up to which averaging the normals is enough.
+const RELAX_NOISE: f64 = 0.1;
+/// Rounds of relaxing the vertices per unit of noise above [`RELAX_NOISE`].
+const RELAX_GAIN: f64 = 40.0;
+/// Most rounds of relaxing the vertices.
+const MAX_RELAX_ROUNDS: f64 = 10.0;
+/// Fewest vertices from which the noise is estimated.
+const MIN_SCAN_VERTICES: usize = 2000;
 
-/// Whether a mesh is crumpled by noise: many triangles differ from their best neighbour. A CAD part's have one in their own plane.
-pub(super) fn crumpled(links: &Links, vector: &[Vec3], needle: &[bool]) -> bool {
+/// Whether a mesh is a noisy scan: many triangles differ from all their neighbours. In a CAD model nearly every
+/// triangle has a neighbour in its own plane.
+pub(super) fn is_noisy(links: &Links, vector: &[Vec3], needle: &[bool]) -> bool {
     let unit = |t: u32| vector.get(t as usize).and_then(|v| v.try_normalize(1e-300));
     let is_needle = |t: u32| needle.get(t as usize).copied().unwrap_or(false);
     let mut angles: Vec<f64> = Vec::with_capacity(vector.len());
@@ -22,17 +31,17 @@ pub(super) fn crumpled(links: &Links, vector: &[Vec3], needle: &[bool]) -> bool 
         let near = links.of(t).iter().filter(|k| !is_needle(**k)).filter_map(|k| unit(*k));
         angles.extend(near.map(|o| (o - own).norm()).min_by(f64::total_cmp));
     }
-    quantile(&mut angles, CRUMPLED.1) > CRUMPLED.0
+    quantile(&mut angles, NOISY_QUANTILE) > NOISY_ANGLE
 }
 
-/// A crumpled mesh with its vertices moved to the middle of their neighbours a few times: the noise goes, and so does what is sharper than a few
-/// triangles. Only good for telling what is flat.
+/// A noisy mesh with its vertices moved towards the mean of their neighbours a few times. This removes the noise, and
+/// also any detail of the size of a few triangles; the result is only used to find flat regions. `noise` is in metres.
 pub(super) fn relaxed(mesh: &Mesh, noise: f64) -> Mesh {
     let mut out = mesh.clone();
     let mut edges: Vec<f64> =
         (0..mesh.triangles.len()).map(|t| mesh.corners(t)).map(|[a, b, _]| (b - a).norm()).collect();
     let ratio = noise / median(&mut edges).max(1e-300);
-    let rounds = ((ratio - RELAX.0) * RELAX.1).ceil().clamp(0.0, RELAX.2) as usize;
+    let rounds = ((ratio - RELAX_NOISE) * RELAX_GAIN).ceil().clamp(0.0, MAX_RELAX_ROUNDS) as usize;
     for _ in 0..rounds {
         let off = umbrella(mesh, &out.vertices);
         for (v, d) in out.vertices.iter_mut().zip(off) {
@@ -42,23 +51,24 @@ pub(super) fn relaxed(mesh: &Mesh, noise: f64) -> Mesh {
     out
 }
 
-/// Unit normals from area vectors, averaged over neighbours across no crease: a scan's triangles are smaller than its noise.
-pub(super) fn smoothed(links: &Links, vector: &[Vec3], needle: &[bool], crumpled: bool) -> Vec<Vec3> {
+/// Unit normals from area vectors, averaged over neighbours but not across creases: the triangles of a scan may be
+/// smaller than its noise.
+pub(super) fn smoothed(links: &Links, vector: &[Vec3], needle: &[bool], noisy: bool) -> Vec<Vec3> {
     let unit = |v: &Vec3| v.try_normalize(1e-300).unwrap_or_default();
     let mut normal: Vec<Vec3> = vector.iter().map(unit).collect();
     let area: Vec<f64> = vector.iter().map(|v| v.norm()).collect();
     let is_needle = |t: usize| needle.get(t).copied().unwrap_or(false);
-    let rounds = ROUNDS[usize::from(crumpled)];
+    let rounds = ROUNDS[usize::from(noisy)];
     for round in 0..rounds {
-        // Noise first: creases are told from crumples only when those are smaller.
-        let crease = if crumpled && round < rounds / 3 { 0.45 } else { 0.85 };
+        // The first rounds reduce the noise; only then can creases be distinguished from it.
+        let crease = if noisy && round < rounds / 3 { 0.45 } else { 0.85 };
         let before = normal.clone();
         for (t, m) in normal.iter_mut().enumerate() {
             let (Some(own), Some(a)) = (before.get(t), area.get(t)) else { continue };
             let mut sum = if is_needle(t) { Vec3::zeros() } else { own * *a };
             for k in links.of(t as u32) {
                 if let (Some(o), Some(a)) = (before.get(*k as usize), area.get(*k as usize)) {
-                    // A needle's own normal is rounding error: it takes its neighbours', whatever they are.
+                    // The normal of a needle is rounding error: it takes that of its neighbours.
                     if is_needle(t) || o.dot(own) > crease {
                         sum += o * *a;
                     }
@@ -70,12 +80,13 @@ pub(super) fn smoothed(links: &Links, vector: &[Vec3], needle: &[bool], crumpled
     normal
 }
 
-/// Standard deviation of a dense mesh's vertices across its surface, metres; 0 for one too coarse to tell.
+/// Standard deviation of the vertices of a dense mesh across its surface, metres; 0 for a mesh with too few vertices.
 ///
-/// From the difference of each vertex from the mean of its neighbours, taken twice: once would take a smooth surface's curvature for noise.
+/// It is estimated from the difference between each vertex and the mean of its neighbours, applied twice: a single
+/// difference would count the curvature of a smooth surface as noise.
 pub(super) fn noise(mesh: &Mesh) -> f64 {
     let n = mesh.vertices.len();
-    if n < 2000 {
+    if n < MIN_SCAN_VERTICES {
         return 0.0;
     }
     let mut normal = vec![Vec3::zeros(); n];
@@ -91,11 +102,12 @@ pub(super) fn noise(mesh: &Mesh) -> f64 {
     let twice = umbrella(mesh, &umbrella(mesh, &mesh.vertices));
     let mut off: Vec<f64> =
         twice.iter().zip(&normal).filter_map(|(d, m)| m.try_normalize(1e-300).map(|m| d.dot(&m).abs())).collect();
-    // Of independent noise, the twofold difference in a mesh of six neighbours has 1.36 times its deviation; 0.6745 of that is its median.
+    // In a mesh with six neighbours per vertex, the second difference of independent noise has 1.36 times its standard
+    // deviation. The median of the absolute value is 0.6745 of that.
     median(&mut off) / (1.36 * 0.6745)
 }
 
-/// Difference of each vertex's value from the mean over its neighbours.
+/// Difference between the value of each vertex and the mean over its neighbours (the umbrella operator).
 fn umbrella(mesh: &Mesh, values: &[Vec3]) -> Vec<Vec3> {
     let mut sum = vec![(Vec3::zeros(), 0u32); values.len()];
     for [a, b, c] in &mesh.triangles {
@@ -115,8 +127,8 @@ fn median(v: &mut [f64]) -> f64 {
     quantile(v, 0.5)
 }
 
-fn quantile(v: &mut [f64], part: f64) -> f64 {
-    let at = ((v.len() as f64 * part) as usize).min(v.len().saturating_sub(1));
+fn quantile(v: &mut [f64], q: f64) -> f64 {
+    let at = ((v.len() as f64 * q) as usize).min(v.len().saturating_sub(1));
     if v.is_empty() {
         return 0.0;
     }

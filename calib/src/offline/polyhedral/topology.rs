@@ -1,4 +1,4 @@
-//! Which triangles meet at which edge, whether they agree on what is outside, and turning them where they do not.
+//! Edges of a mesh, and the consistent orientation of its triangles.
 
 use super::bvh::Bvh;
 use super::mesh::Mesh;
@@ -7,32 +7,32 @@ use graspd_rt::geom::Vec3;
 /// An edge with the one or two triangles that meet there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Edge {
-    /// Its ends, indices of vertices, the lower first.
+    /// Indices of its vertices, the lower first.
     pub ends: [u32; 2],
-    /// A triangle at it.
+    /// The first triangle at the edge.
     pub one: u32,
-    /// The other; `None` at an open edge and at one where more than two meet.
+    /// The second triangle; `None` at an open edge and at one where more than two triangles meet.
     pub other: Option<u32>,
-    /// Whether the two run along it in opposite directions, as neighbours with one outside do.
+    /// Whether the triangles traverse the edge in opposite directions, as consistently oriented neighbours do.
     pub agree: bool,
 }
 
-/// What was found, and mended.
+/// The defects found by [`orient`], most of which it corrects.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Topology {
-    /// Triangles turned to agree with their neighbours.
+    /// Number of triangles reversed to agree with their neighbours.
     pub turned: usize,
     /// Whether the whole mesh was inside out.
     pub inside_out: bool,
-    /// Edges with one triangle.
+    /// Number of edges with one triangle.
     pub open: usize,
-    /// Edges with more than two.
+    /// Number of edges with more than two triangles.
     pub crowded: usize,
-    /// Edges whose triangles cannot be made to agree.
+    /// Number of edges whose triangles cannot be oriented consistently.
     pub one_sided: usize,
 }
 
-/// Every edge of a mesh.
+/// All edges of a mesh.
 pub fn edges(mesh: &Mesh) -> Vec<Edge> {
     let mut out = Vec::with_capacity(mesh.triangles.len() * 3 / 2);
     groups(mesh, |ends, sides| match sides {
@@ -42,7 +42,8 @@ pub fn edges(mesh: &Mesh) -> Vec<Edge> {
     out
 }
 
-/// Calls `each` with every edge and its triangles, each with whether it runs from the lower to the higher vertex.
+/// Calls `each` with every edge and its triangles, each with whether it traverses the edge from the lower vertex to the
+/// higher.
 fn groups(mesh: &Mesh, mut each: impl FnMut([u32; 2], &[(u32, bool)])) {
     let mut sides: Vec<([u32; 2], (u32, bool))> = Vec::with_capacity(3 * mesh.triangles.len());
     for (t, [a, b, c]) in mesh.triangles.iter().enumerate() {
@@ -61,12 +62,13 @@ fn groups(mesh: &Mesh, mut each: impl FnMut([u32; 2], &[(u32, bool)])) {
     }
 }
 
-/// Turns triangles so that neighbours agree (the fewer of each piece are turned), then every piece that is inside out.
-pub fn mend(mesh: &mut Mesh) -> Topology {
+/// Orients the triangles: first consistently within each connected component (the minority is reversed), then every
+/// component that is inside out.
+pub fn orient(mesh: &mut Mesh) -> Topology {
     let mut found = Topology::default();
     let n = mesh.triangles.len();
     let mut near: Vec<Vec<(u32, bool)>> = vec![Vec::new(); n];
-    let mut whole = vec![true; n];
+    let mut closed = vec![true; n];
     groups(mesh, |_, sides| match sides {
         [(t, d), (u, e)] => {
             for (x, y) in [(*t, *u), (*u, *t)] {
@@ -81,20 +83,20 @@ pub fn mend(mesh: &mut Mesh) -> Topology {
                 _ => found.crowded += 1,
             }
             for (t, _) in sides {
-                if let Some(w) = whole.get_mut(*t as usize) {
+                if let Some(w) = closed.get_mut(*t as usize) {
                     *w = false;
                 }
             }
         }
     });
     let mut turn = vec![None; n];
-    let mut pieces = Vec::new();
+    let mut components = Vec::new();
     for first in 0..n as u32 {
         if turn.get(first as usize).is_some_and(Option::is_none) {
-            pieces.push(agree(first, &near, &mut turn, &mut found));
+            components.push(orient_component(first, &near, &mut turn, &mut found));
         }
     }
-    // Each such edge was met from both sides.
+    // Each such edge was counted from both sides.
     found.one_sided /= 2;
     for (t, flip) in mesh.triangles.iter_mut().zip(&turn) {
         if *flip == Some(true) {
@@ -102,9 +104,9 @@ pub fn mend(mesh: &mut Mesh) -> Topology {
             found.turned += 1;
         }
     }
-    let inwards = inwards(mesh, &pieces, &whole);
-    found.inside_out = !inwards.is_empty() && inwards.len() == pieces.len();
-    for t in inwards.iter().filter_map(|k| pieces.get(*k)).flatten() {
+    let inwards = inwards(mesh, &components, &closed);
+    found.inside_out = !inwards.is_empty() && inwards.len() == components.len();
+    for t in inwards.iter().filter_map(|k| components.get(*k)).flatten() {
         if let Some(t) = mesh.triangles.get_mut(*t as usize) {
             t.swap(1, 2);
         }
@@ -113,81 +115,89 @@ pub fn mend(mesh: &mut Mesh) -> Topology {
     found
 }
 
-/// Walks a piece from its first triangle and marks which of them have to be turned so that all agree: the fewer ones. Returns the piece.
-fn agree(first: u32, near: &[Vec<(u32, bool)>], turn: &mut [Option<bool>], found: &mut Topology) -> Vec<u32> {
-    let mut piece = vec![first];
+/// Collects the component of a triangle and marks in `turn` the minority of its triangles that has to be reversed so
+/// that all agree.
+fn orient_component(
+    first: u32,
+    near: &[Vec<(u32, bool)>],
+    turn: &mut [Option<bool>],
+    found: &mut Topology,
+) -> Vec<u32> {
+    let mut component = vec![first];
     let mut next = 0;
     if let Some(t) = turn.get_mut(first as usize) {
         *t = Some(false);
     }
-    while let Some(t) = piece.get(next).copied() {
+    while let Some(t) = component.get(next).copied() {
         next += 1;
         let own = turn.get(t as usize).copied().flatten().unwrap_or(false);
         for (u, agree) in near.get(t as usize).into_iter().flatten() {
-            // A neighbour that agrees is turned when this one is; one that disagrees when this one is not.
-            let wanted = own == *agree;
+            // A neighbour that agrees is reversed with this triangle; one that disagrees is reversed if this one is
+            // not.
+            let required = own == *agree;
             match turn.get_mut(*u as usize) {
                 Some(slot @ None) => {
-                    *slot = Some(wanted);
-                    piece.push(*u);
+                    *slot = Some(required);
+                    component.push(*u);
                 }
-                Some(Some(is)) if *is != wanted => found.one_sided += 1,
+                Some(Some(is)) if *is != required => found.one_sided += 1,
                 _ => {}
             }
         }
     }
-    let against = piece.iter().filter(|t| turn.get(**t as usize).copied().flatten() == Some(true)).count();
-    if 2 * against > piece.len() {
-        for t in &piece {
+    let against = component.iter().filter(|t| turn.get(**t as usize).copied().flatten() == Some(true)).count();
+    if 2 * against > component.len() {
+        for t in &component {
             if let Some(Some(x)) = turn.get_mut(*t as usize) {
                 *x = !*x;
             }
         }
     }
-    piece
+    component
 }
 
-/// Pieces of a mesh that are asked for their own inside at most: more are crumbs of a broken file, and only judged together.
-const MOST_PIECES: usize = 3000;
+/// Most components that are tested separately; a mesh with more is a damaged file, and is tested as a whole.
+const MAX_COMPONENTS: usize = 3000;
 
-/// Which pieces of a mesh are wound inwards.
+/// The components of a mesh whose normals point inwards.
 ///
-/// A closed piece says so by the sign of its own volume, unless it is a hollow within another one: that goes with the piece round it. A piece
-/// with open edges is a part of a surface that other pieces complete: rays from either side of it count what they meet.
-fn inwards(mesh: &Mesh, pieces: &[Vec<u32>], whole: &[bool]) -> Vec<usize> {
+/// For a closed component the sign of its volume decides, unless it is a cavity inside another one: a cavity is
+/// reversed only with the whole mesh. A component with open edges is a part of a surface that others complete: the
+/// parity of ray crossings on both sides of it decides.
+fn inwards(mesh: &Mesh, components: &[Vec<u32>], closed: &[bool]) -> Vec<usize> {
     let all = |mesh: &Mesh| {
-        if volume(mesh, 0..mesh.triangles.len() as u32) < 0.0 { (0..pieces.len()).collect() } else { Vec::new() }
+        if volume(mesh, 0..mesh.triangles.len() as u32) < 0.0 { (0..components.len()).collect() } else { Vec::new() }
     };
-    if pieces.len() == 1 || pieces.len() > MOST_PIECES {
+    if components.len() == 1 || components.len() > MAX_COMPONENTS {
         return all(mesh);
     }
     let tree = Bvh::new(mesh);
-    let mut piece_of = vec![0u32; mesh.triangles.len()];
-    for (k, piece) in pieces.iter().enumerate() {
-        for t in piece {
-            if let Some(p) = piece_of.get_mut(*t as usize) {
+    let mut component_of = vec![0u32; mesh.triangles.len()];
+    for (k, component) in components.iter().enumerate() {
+        for t in component {
+            if let Some(p) = component_of.get_mut(*t as usize) {
                 *p = k as u32;
             }
         }
     }
-    let of = |t: u32| piece_of.get(t as usize).copied().unwrap_or(0);
-    let (mut out, mut hollow, mut outer) = (Vec::new(), Vec::new(), 0usize);
-    for (k, piece) in pieces.iter().enumerate() {
-        let samples = piece.iter().step_by((piece.len() / 9).max(1));
+    let of = |t: u32| component_of.get(t as usize).copied().unwrap_or(0);
+    let (mut out, mut cavities, mut outer) = (Vec::new(), Vec::new(), 0usize);
+    for (k, component) in components.iter().enumerate() {
+        let samples = component.iter().step_by((component.len() / 9).max(1));
         let centre = |t: u32| mesh.corners(t as usize).iter().sum::<Vec3>() / 3.0;
-        if piece.iter().all(|t| whole.get(*t as usize).copied().unwrap_or(false)) {
-            // Most of its surface, because pieces of a part may also reach into each other.
+        if component.iter().all(|t| closed.get(*t as usize).copied().unwrap_or(false)) {
+            // A cavity is inside at all samples: components of a part may also overlap.
             let (mut within, mut n) = (0, 0);
             for t in samples {
                 n += 1;
                 within += usize::from(tree.odd(&centre(*t), |u| of(u) as usize != k));
             }
             if within == n {
-                hollow.push(k);
+                cavities.push(k);
                 continue;
             }
             outer += 1;
-            if volume(mesh, piece.iter().copied()) < 0.0 {
+            if volume(mesh, component.iter().copied()) < 0.0 {
                 out.push(k);
             }
             continue;
@@ -198,7 +208,7 @@ fn inwards(mesh: &Mesh, pieces: &[Vec<u32>], whole: &[bool]) -> Vec<usize> {
         for t in samples {
             let [a, b, c] = mesh.corners(*t as usize);
             let Some(normal) = (b - a).cross(&(c - a)).try_normalize(0.0) else { continue };
-            // Before the surface and behind it: where the two do not differ, the mesh is no solid there.
+            // In front of the surface and behind it: if the two do not differ, the mesh is not a solid there.
             let [before, behind] = [skin, -skin].map(|s| tree.odd(&(centre(*t) + normal * s), |_| true));
             inside += usize::from(before && !behind);
             outside += usize::from(!before && behind);
@@ -207,14 +217,14 @@ fn inwards(mesh: &Mesh, pieces: &[Vec<u32>], whole: &[bool]) -> Vec<usize> {
             out.push(k);
         }
     }
-    // A mesh that is inside out as a whole is so in its hollows too.
+    // If all outer components are inside out, the cavities are too.
     if outer > 0 && out.len() == outer {
-        out.extend(hollow);
+        out.extend(cavities);
     }
     out
 }
 
-/// Volume enclosed by some triangles (of an open surface: with the mesh's centre for the missing part).
+/// Signed volume enclosed by some triangles; an open surface is closed by a cone to the centre of the mesh.
 fn volume(mesh: &Mesh, of: impl IntoIterator<Item = u32>) -> f64 {
     let c = mesh.centre();
     of.into_iter()

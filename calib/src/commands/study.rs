@@ -1,7 +1,9 @@
-//! `graspd study`: how close the off-line stage comes to the Cramer-Rao bound, and whether its covariances are honest.
+//! `graspd study`: the accuracy of the off-line stage against the Cramer-Rao bound, and the consistency of its
+//! covariances.
 //!
-//! The cells are those of the accuracy study, with cells for gross outliers and occlusion added. Every trial places a rim at random, adds
-//! noise, reconstructs, and compares with the truth; bounds are computed at the truth from noise-free points.
+//! The cells are those of the accuracy study, with cells for gross outliers and occlusion added. Every trial draws a
+//! random rim, adds noise, reconstructs and compares with ground truth. The bounds are computed at the true rim from
+//! noise-free points.
 
 use crate::offline::conic::sampson::Cloud;
 use crate::offline::decide::reconstruct::reconstruct;
@@ -16,7 +18,7 @@ use nalgebra::{SMatrix, SVector, Vector2, Vector3};
 use std::f64::consts::TAU;
 use std::fmt::Write as _;
 
-/// A scene of the study. Lengths in metres.
+/// A cell of the study. Lengths in metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cell {
     /// Name in the table.
@@ -25,23 +27,23 @@ pub struct Cell {
     pub baseline: f64,
     /// Focal length, pixels.
     pub focal: f64,
-    /// Noise of an edge point in each coordinate, pixels.
+    /// Standard deviation of an edge point in each coordinate, pixels.
     pub sigma: f64,
     /// Semi-major axis.
     pub radius: f64,
-    /// Minor over major axis: 1 is fitted as a circle and as an ellipse.
+    /// Minor over major axis. A rim with ratio 1 is fitted as a circle and as an ellipse.
     pub ratio: f64,
     /// Angle between the normal and the viewing direction, degrees.
     pub tilt_deg: f64,
-    /// Fraction of the rim that is seen.
+    /// Visible fraction of the rim.
     pub arc: f64,
-    /// Fraction of the edge points that lie on something else.
+    /// Fraction of the edge points that are gross outliers.
     pub outliers: f64,
     /// Edge points in each view.
     pub points: usize,
 }
 
-/// Nominal scene of the study.
+/// The nominal cell.
 const NOMINAL: Cell = Cell {
     name: "nominal",
     baseline: 0.5,
@@ -55,7 +57,7 @@ const NOMINAL: Cell = Cell {
     points: 200,
 };
 
-/// The scenes of the study.
+/// The cells of the study.
 pub fn cells() -> Vec<Cell> {
     let n = NOMINAL;
     vec![
@@ -84,30 +86,30 @@ pub fn cells() -> Vec<Cell> {
     ]
 }
 
-/// What a model achieved in a cell.
+/// Accuracy of a rim model in a cell.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Outcome {
-    /// Trials that were answered.
+pub struct Accuracy {
+    /// Trials with a reconstruction.
     pub answered: usize,
-    /// Trials that were refused.
+    /// Trials whose reconstruction was refused.
     pub refused: usize,
     /// Root mean square error of the centre, metres.
     pub centre_rmse: f64,
-    /// 95th percentile of the centre's error, metres.
+    /// 95th percentile of the centre error, metres.
     pub centre_p95: f64,
     /// Root mean square error of the normal, radians.
     pub normal_rmse: f64,
-    /// 95th percentile of the normal's error, radians.
+    /// 95th percentile of the normal error, radians.
     pub normal_p95: f64,
-    /// Centre's RMSE over its Cramer-Rao bound (of the inliers).
+    /// RMSE of the centre over its Cramer-Rao bound (of the inliers).
     pub centre_ratio: f64,
-    /// Normal's RMSE over its Cramer-Rao bound (of the inliers).
+    /// RMSE of the normal over its Cramer-Rao bound (of the inliers).
     pub normal_ratio: f64,
-    /// Fraction of trials whose truth lies in the 95 % region of the centre.
+    /// Fraction of trials whose true centre is in the estimate's 95 % region.
     pub coverage: f64,
-    /// Mean squared Mahalanobis distance of the centre; 3 is honest.
+    /// Mean squared Mahalanobis distance of the centre; 3 for a consistent covariance.
     pub mahalanobis: f64,
-    /// The same of centre and normal together; 5 is honest.
+    /// Mean squared Mahalanobis distance of centre and normal together; 5 for a consistent covariance.
     pub mahalanobis5: f64,
 }
 
@@ -127,7 +129,7 @@ fn scene(cell: &Cell, random: &mut Random) -> Option<Scene> {
     let (tilt, azimuth) = (cell.tilt_deg.to_radians(), random.uniform(0.0, TAU));
     let n = f.column(2) * tilt.cos() + (f.column(0) * azimuth.cos() + f.column(1) * azimuth.sin()) * tilt.sin();
     let rim = rim_of(x, n, cell.radius, cell.radius * cell.ratio, random.uniform(0.0, TAU / 2.0));
-    // As the study: not a rim that a camera sees at less than about five degrees.
+    // As in the study: no rim that a camera sees at an angle of less than about five degrees.
     for q in &p {
         if (camera_centre(q)? - x).dot(&rim.normal) < 0.08 * 1.5 {
             return None;
@@ -159,8 +161,10 @@ fn scene(cell: &Cell, random: &mut Random) -> Option<Scene> {
     Some(Scene { rim, p, points, exact })
 }
 
-/// Pixels at equal steps of arc length in the image, over a part of the rim.
-fn equal_steps(p: &Projection, rim: &Rim, n: usize, from: f64, part: f64) -> Vec<Vector2<f64>> {
+/// Pixels at equal steps of arc length in the image, over the arc that begins at the fraction `from` of the rim and
+/// covers the fraction `arc` of it.
+fn equal_steps(p: &Projection, rim: &Rim, n: usize, from: f64, arc: f64) -> Vec<Vector2<f64>> {
+    /// Chords that approximate the arc length of the whole rim.
     const FINE: usize = 1000;
     let mut length = Vec::with_capacity(FINE + 1);
     let mut last = project(p, &rim_point(rim, 0.0));
@@ -173,7 +177,7 @@ fn equal_steps(p: &Projection, rim: &Rim, n: usize, from: f64, part: f64) -> Vec
     let total = length[FINE];
     (0..n)
         .map(|i| {
-            let s = (from + part * (i as f64 + 0.5) / n as f64) * total;
+            let s = (from + arc * (i as f64 + 0.5) / n as f64) * total;
             let k = length.partition_point(|l| *l <= s).clamp(1, FINE);
             let t = (k - 1) as f64 + (s - length[k - 1]) / (length[k] - length[k - 1]);
             project(p, &rim_point(rim, TAU * t / FINE as f64))
@@ -181,7 +185,7 @@ fn equal_steps(p: &Projection, rim: &Rim, n: usize, from: f64, part: f64) -> Vec
         .collect()
 }
 
-/// Running sums of a model.
+/// Running sums of one model in one cell.
 #[derive(Default)]
 struct Tally {
     centre: Vec<f64>,
@@ -226,10 +230,10 @@ impl Tally {
         self.squared5 += cov.try_inverse().map_or(f64::INFINITY, |i| all.dot(&(i * all)));
     }
 
-    fn outcome(mut self) -> Outcome {
+    fn accuracy(mut self) -> Accuracy {
         let n = self.centre.len();
         if n == 0 {
-            return Outcome { refused: self.refused, ..Outcome::default() };
+            return Accuracy { refused: self.refused, ..Accuracy::default() };
         }
         let count = n as f64;
         let rms = |v: &[f64]| (v.iter().map(|x| x * x).sum::<f64>() / count).sqrt();
@@ -238,7 +242,7 @@ impl Tally {
             v.sort_by(f64::total_cmp);
             v[(n * 95 / 100).min(n - 1)]
         };
-        Outcome {
+        Accuracy {
             answered: n,
             refused: self.refused,
             centre_rmse,
@@ -254,11 +258,11 @@ impl Tally {
     }
 }
 
-/// Runs a cell: outcomes of the maximum-likelihood circle (for round rims) and ellipse.
-pub fn run(cell: &Cell, trials: usize, seed: u64) -> (Option<Outcome>, Outcome) {
+/// Runs a cell. Returns the accuracy of the maximum-likelihood circle (`None` for a rim that is not round) and ellipse.
+pub fn run(cell: &Cell, trials: usize, seed: u64) -> (Option<Accuracy>, Accuracy) {
     let options = |rim| Options {
         rim,
-        // The study measures the estimator, not the task's tolerance.
+        // The study measures the estimator; the tolerances of a task do not apply.
         max_sigma_normal: f64::INFINITY,
         max_sigma_centre: Some(f64::INFINITY),
         max_noise_px: 6.0,
@@ -271,7 +275,7 @@ pub fn run(cell: &Cell, trials: usize, seed: u64) -> (Option<Outcome>, Outcome) 
     let mut attempt = 0;
     while done < trials && attempt < 20 * trials {
         attempt += 1;
-        // One stream per attempt: the same scenes in every cell, as in the study.
+        // One random stream per attempt gives every cell the same scenes.
         let mut random = Random::new(seed.wrapping_add(attempt as u64));
         let Some(scene) = scene(cell, &mut random) else { continue };
         done += 1;
@@ -287,13 +291,15 @@ pub fn run(cell: &Cell, trials: usize, seed: u64) -> (Option<Outcome>, Outcome) 
             }
         }
     }
-    (if cell.ratio == 1.0 { Some(circle.outcome()) } else { None }, ellipse.outcome())
+    ((cell.ratio == 1.0).then(|| circle.accuracy()), ellipse.accuracy())
 }
 
-/// The study as a table: the given cells, both models. `progress` is called after each cell with its name.
+/// Runs the given cells and returns a table with one line per cell and model. `progress` is called with the name of
+/// each finished cell.
 pub fn table(cells: &[Cell], trials: usize, seed: u64, mut progress: impl FnMut(&str)) -> String {
     let mut out = String::from(
-        "cell                        model    trials refused  centre mm (95 %)  normal deg (95 %)  RMSE/CRB c     n    coverage  d2(3)  d2(5)\n",
+        "cell                        model    trials refused  centre mm (95 %)  normal deg (95 %)  \
+         RMSE/CRB c     n    coverage  d2(3)  d2(5)\n",
     );
     for cell in cells {
         let (circle, ellipse) = run(cell, trials, seed);
@@ -302,7 +308,8 @@ pub fn table(cells: &[Cell], trials: usize, seed: u64, mut progress: impl FnMut(
             // Writing to a String cannot fail.
             let _ = writeln!(
                 out,
-                "{:<27} {model:<8} {:>6} {:>7}  {:>7.3} ({:>6.3})  {:>8.3} ({:>6.3})  {:>9.3} {:>6.3}  {:>8.3}  {:>5.2}  {:>5.2}",
+                "{:<27} {model:<8} {:>6} {:>7}  {:>7.3} ({:>6.3})  {:>8.3} ({:>6.3})  \
+                 {:>9.3} {:>6.3}  {:>8.3}  {:>5.2}  {:>5.2}",
                 cell.name,
                 o.answered,
                 o.refused,
@@ -327,8 +334,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_bound_is_reached_and_the_covariance_is_honest() {
-        // Few trials: wide limits that a wrong covariance or an inefficient estimator still breaks.
+    fn the_bound_is_reached_and_the_covariance_is_consistent() {
+        // With few trials the limits are wide; a wrong covariance or an inefficient estimator still exceeds them.
         for name in ["nominal", "rim 50 %", "outliers 20 %", "30 % hidden, outliers 20 %"] {
             let cell = cells().into_iter().find(|c| c.name == name).unwrap();
             let (circle, ellipse) = run(&cell, 150, 99);

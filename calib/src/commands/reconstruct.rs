@@ -1,11 +1,12 @@
-//! `graspd reconstruct`: a file of two-view cases in, a file of reconstructions out, with every intermediate result.
+//! `graspd reconstruct`: a file of two-view cases in, a file of reconstructions with every intermediate result out.
 //!
-//! Of a case only `id`, `image_size`, `P_left`, `P_right`, `points_left`, `points_right` and `sigma_px` are read, and the file's
-//! `gripper`. A case that cannot be read or reconstructed gets `"status": "error"` with the reason and spoils no other.
+//! Of the file, `cases` and `gripper` are read; of a case, `id`, `image_size`, `P_left`, `P_right`, `points_left`,
+//! `points_right` and `sigma_px`. A case that cannot be read or reconstructed gets `"status": "error"` and the reason;
+//! it does not affect the others.
 
 use crate::offline::conic::sampson::distance;
 use crate::offline::conic::{ellipse_of, fit_direct, fit_ml};
-use crate::offline::handle::visibility::{Eye, FlatMark};
+use crate::offline::handle::visibility::{FlatMark, PinholeCamera};
 use crate::offline::handle::{grasp_circle, grasp_ellipse};
 use crate::offline::rim::choice::choose_plane_model;
 use crate::offline::rim::circle::{ClosedForm, vergence};
@@ -18,23 +19,23 @@ use crate::offline::types::{EdgePoint, Ellipse2, Scatter};
 use nalgebra::{Isometry3, Matrix2, Matrix3, Point3, Vector2, Vector3};
 use serde_json::{Map, Value, json};
 
-/// Why a whole file cannot be processed.
+/// Why a file as a whole cannot be processed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// It is not JSON.
+    /// The text is not JSON.
     #[error("the case file is not JSON: {0}")]
     Json(#[from] serde_json::Error),
-    /// It has no list of cases.
-    #[error("the case file has no list `cases`")]
+    /// There is no list of cases.
+    #[error("the case file has no list `cases`: give a file with {{ \"cases\": [...] }}")]
     NoCases,
 }
 
-/// Reconstructs every case of a file; returns the results as JSON, in the order of the cases.
+/// Reconstructs every case of a file. Returns the results as JSON, in the order of the cases.
 ///
 /// # Errors
-/// Only when the file as a whole is unusable: not JSON, or without a list of cases.
+/// Only if the file as a whole is unusable: not JSON, or without a list of cases.
 pub fn reconstruct_file(cases_json: &str) -> Result<String, Error> {
-    // Some editors begin a file with a mark of its encoding.
+    // Some editors write a byte-order mark.
     let text = cases_json.strip_prefix('\u{feff}').unwrap_or(cases_json);
     let file: Value = serde_json::from_str(&finite_numbers(text))?;
     let cases = file.get("cases").and_then(Value::as_array).ok_or(Error::NoCases)?;
@@ -46,7 +47,8 @@ pub fn reconstruct_file(cases_json: &str) -> Result<String, Error> {
     Ok(serde_json::to_string_pretty(&json!({ "schema": "conic-results/1", "cases": results }))?)
 }
 
-/// Replaces the tokens `NaN`, `Infinity` and numbers beyond f64 by null, outside strings, so that one bad number spoils one case only.
+/// Replaces the tokens `NaN` and `Infinity` and numbers beyond the range of f64 by null, outside strings, so that one
+/// bad number invalidates one case only.
 fn finite_numbers(text: &str) -> String {
     let bytes = text.as_bytes();
     let mut out = String::with_capacity(text.len());
@@ -67,8 +69,8 @@ fn finite_numbers(text: &str) -> String {
                     i += 1;
                 }
                 let token = &text[from..i];
-                let word = matches!(token.trim_start_matches('-'), "NaN" | "Infinity");
-                if word || token.parse::<f64>().is_ok_and(|v| !v.is_finite()) {
+                let named = matches!(token.trim_start_matches('-'), "NaN" | "Infinity");
+                if named || token.parse::<f64>().is_ok_and(|v| !v.is_finite()) {
                     out.push_str(&text[copied..from]);
                     out.push_str("null");
                     copied = i;
@@ -81,11 +83,15 @@ fn finite_numbers(text: &str) -> String {
     out
 }
 
-/// A case as read.
+/// A parsed case.
 struct Case {
+    /// Image width and height, pixels.
     size: [f64; 2],
+    /// Projection matrices, left and right.
     p: [Projection; 2],
+    /// Edge points, left and right.
     points: [Vec<EdgePoint>; 2],
+    /// Standard deviation of an edge point, pixels; 0 where it is not given.
     sigma: f64,
 }
 
@@ -117,7 +123,7 @@ fn read(case: &Value) -> Result<Case, String> {
     }
     let sigma = match case.get("sigma_px") {
         None | Some(Value::Null) => 0.0,
-        Some(v) => v.as_f64().filter(|s| *s >= 0.0).ok_or("`sigma_px` is not a number of 0 or more")?,
+        Some(v) => v.as_f64().filter(|s| *s >= 0.0).ok_or("`sigma_px` is not a number >= 0")?,
     };
     let points = |key: &str| -> Result<Vec<EdgePoint>, String> {
         let rows = field(key)?.as_array().ok_or_else(|| format!("`{key}` is not a list"))?;
@@ -146,12 +152,12 @@ fn read(case: &Value) -> Result<Case, String> {
 
 /// A list of finite numbers.
 fn numbers(v: &Value, what: &str) -> Result<Vec<f64>, String> {
-    let list = v.as_array().ok_or_else(|| format!("`{what}` holds something that is not a list of numbers"))?;
+    let list = v.as_array().ok_or_else(|| format!("`{what}` has an entry that is not a list of numbers"))?;
     list.iter()
         .map(|x| {
             x.as_f64()
                 .filter(|x| x.is_finite())
-                .ok_or_else(|| format!("`{what}` holds something that is not a finite number"))
+                .ok_or_else(|| format!("`{what}` has an entry that is not a finite number"))
         })
         .collect()
 }
@@ -176,7 +182,7 @@ fn gripper(g: &Value) -> Result<Vec<FlatMark>, String> {
     Ok(marks.iter().zip(&normals).map(|(m, n)| FlatMark { position: *m, normal: *n, area }).collect())
 }
 
-/// The options of the case files: no outliers, generous limits (a case states its own expectations).
+/// Options for the case files: points without outliers, and wide limits, because a case states its own expectations.
 fn options(sigma: f64) -> Options {
     Options {
         rim: RimChoice::Edge,
@@ -189,17 +195,17 @@ fn options(sigma: f64) -> Options {
     }
 }
 
-/// Tells from the points themselves whether they scatter across the contour only.
+/// Estimates from the points whether their noise is across the contour only, because a case does not state it.
 ///
-/// A case does not say. Points taken at regular steps along a contour keep their step to far better than they scatter across it when the
-/// noise is across only; isotropic noise spoils the step as much as the distance. Irregular points count as isotropic.
+/// Points sampled at regular steps along a contour keep that step if their noise is across the contour only; isotropic
+/// noise changes the step as much as the distance from the curve. Irregularly sampled points are taken as isotropic.
 fn scatter(points: &[Vec<EdgePoint>; 2]) -> Scatter {
     let across = points.iter().all(|list| {
         let Ok(fit) = fit_ml(list, Scatter::Isotropic) else { return false };
         let feet: Vec<Vector2<f64>> = list.iter().map(|p| foot(&fit.conic, &p.uv)).collect();
         let steps: Vec<f64> = feet.windows(2).map(|w| (w[1] - w[0]).norm()).collect();
-        // Equal steps in angle lengthen and shorten along an ellipse; every difference more takes away what is smooth and leaves the noise,
-        // its variance times (2k choose k) for the k-th difference of the places.
+        // Equal steps in angle have a length that varies smoothly along an ellipse. Each further difference reduces the
+        // smooth part; the k-th difference of the positions has (2k choose k) times the noise variance.
         let mut differences = steps;
         let mut along = f64::INFINITY;
         for (order, gain) in [(2, 6.0), (3, 20.0), (4, 70.0), (5, 252.0), (6, 924.0)] {
@@ -211,13 +217,14 @@ fn scatter(points: &[Vec<EdgePoint>; 2]) -> Scatter {
         }
         let scattered =
             (list.iter().map(|p| distance(&fit.conic, &p.uv).powi(2)).sum::<f64>() / list.len() as f64).sqrt();
-        // One step's length scatters by a fifth where there are twenty of them.
+        // The estimate from 20 steps has a relative standard deviation of about one fifth.
         list.len() >= 20 && along < 0.4 * scattered
     });
     if across { Scatter::Across } else { Scatter::Isotropic }
 }
 
-/// The point of a conic nearest to a pixel, by a few tangents: the gradient at the pixel itself points elsewhere where the curve is tight.
+/// The point of a conic nearest to a pixel, by three Newton steps on the tangent: where the curvature is high, the
+/// gradient at the pixel itself does not point to the nearest point.
 fn foot(conic: &Matrix3<f64>, uv: &Vector2<f64>) -> Vector2<f64> {
     let normal = |q: &Vector2<f64>| {
         let g = conic * Vector3::new(q.x, q.y, 1.0);
@@ -237,13 +244,13 @@ fn reconstruct_case(case: &Case, marks: Option<&[FlatMark]>) -> Result<Map<Strin
     let a = analyse([&case.points[0], &case.points[1]], p, &options).map_err(|e| e.to_string())?;
     a.verdict.clone().map_err(|e| e.to_string())?;
     let (chosen, _) = choose_plane_model(&a, RimChoice::Edge, &options).map_err(|e| e.to_string())?;
-    // Residuals are weighted by 1/sigma inside; the file wants pixels.
+    // The fit weights residuals by 1/sigma; the file holds pixels.
     let unit = if case.sigma > 0.0 { case.sigma } else { 1.0 };
     let mut out = Map::new();
     for (k, side) in ["left", "right"].into_iter().enumerate() {
         let direct = fit_direct(&case.points[k]).ok().and_then(|c| ellipse_of(&c));
-        out.insert(format!("fit_{side}_direct"), direct.map_or(Value::Null, |e| five(&e)));
-        out.insert(format!("fit_{side}_ml"), five(&a.fits[k].fit.ellipse));
+        out.insert(format!("fit_{side}_direct"), direct.map_or(Value::Null, |e| ellipse_values(&e)));
+        out.insert(format!("fit_{side}_ml"), ellipse_values(&a.fits[k].fit.ellipse));
         out.insert(format!("sigma_{side}"), json!(a.fits[k].fit.noise * unit));
     }
     out.insert("paper".into(), a.paper.as_ref().map_or(Value::Null, closed_form));
@@ -263,10 +270,10 @@ fn reconstruct_case(case: &Case, marks: Option<&[FlatMark]>) -> Result<Map<Strin
 }
 
 fn grasps(out: &mut Map<String, Value>, a: &Analysis, case: &Case, marks: &[FlatMark]) {
-    let (Some(l), Some(r)) = (Eye::new(&case.p[0], case.size), Eye::new(&case.p[1], case.size)) else { return };
-    let eyes = [l, r];
+    let [Some(l), Some(r)] = [0, 1].map(|k| PinholeCamera::new(&case.p[k], case.size)) else { return };
+    let cameras = [l, r];
     if let Ok(fit) = &a.circle {
-        let g = grasp_circle(&fit.rim, marks, &eyes, 0.0);
+        let g = grasp_circle(&fit.rim, marks, &cameras, 0.0);
         let mut v = set_point(&g.pose, marks, &case.p);
         let per_camera = g
             .per_camera
@@ -277,7 +284,7 @@ fn grasps(out: &mut Map<String, Value>, a: &Analysis, case: &Case, marks: &[Flat
         out.insert("grasp_circle".into(), Value::Object(v));
     }
     if let Ok(fit) = &a.ellipse {
-        let four = grasp_ellipse(&fit.rim, (fit.rim.a, fit.rim.b), marks, &eyes, 0.0, f64::INFINITY).map(|g| {
+        let four = grasp_ellipse(&fit.rim, (fit.rim.a, fit.rim.b), marks, &cameras, 0.0, f64::INFINITY).map(|g| {
             let mut v = set_point(&g.pose, marks, &case.p);
             v.insert("index".into(), json!(g.index));
             v.insert("opening".into(), json!(g.opening));
@@ -289,7 +296,7 @@ fn grasps(out: &mut Map<String, Value>, a: &Analysis, case: &Case, marks: &[Flat
     }
 }
 
-/// The gripper's pose and the predicted marks in space and in both images.
+/// A gripper pose, and the predicted marks in space and in both images.
 fn set_point(pose: &Isometry3<f64>, marks: &[FlatMark], p: &[Projection; 2]) -> Map<String, Value> {
     let world: Vec<Vector3<f64>> = marks.iter().map(|m| (pose * Point3::from(m.position)).coords).collect();
     let image = |p: &Projection| -> Vec<[f64; 2]> { world.iter().map(|x| project(p, x)).map(|u| [u.x, u.y]).collect() };
@@ -302,7 +309,8 @@ fn set_point(pose: &Isometry3<f64>, marks: &[FlatMark], p: &[Projection; 2]) -> 
     out
 }
 
-fn five(e: &Ellipse2) -> Value {
+/// Centre u and v, semi-axes a and b (pixels), angle of a (radians).
+fn ellipse_values(e: &Ellipse2) -> Value {
     json!([e.centre.x, e.centre.y, e.a, e.b, e.theta])
 }
 
