@@ -1,11 +1,11 @@
-//! A UR controller behind the arm trait: set up on an ordinary thread, then driven by the command thread.
+//! The link to a UR controller over RTDE: set up on an ordinary thread, then used by the command thread.
 
 use std::io::{self, Read, Write};
 use std::net::TcpStream;
 use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
-use graspd_rt::arm::{ArmCommand, ArmMode, Joints, RobotState};
+use graspd_rt::arm::{ArmCommand, ArmMode, Joints, ROBOT_MODE_RUNNING, RobotState};
 use graspd_rt::rtde::{
     COMMAND_FIELDS, ClientError, ClockStep, CommandWriter, ControllerVersion, Event, Framer, GapMeter, MAX_PACKAGE,
     NEEDED_FIELDS, Phase, SCRIPT_VERSION, STATE_FIELDS, Session, StateReader, Version, script_state,
@@ -13,21 +13,16 @@ use graspd_rt::rtde::{
 
 use super::link::{ArmLink, LinkFault, LinkPoll, LinkStats};
 use super::script::start_script;
+use super::status::SAFETY_STOPPED_BITS;
 use super::ur_config::{ArmError, Motion, Port, UrConfig, fresh_token};
 
-/// A send buffer that stays full for this long is a fault.
-const BLOCKED_NS: u64 = 20_000_000;
+/// Time for which the send buffer may stay full before the link fails, ns.
+const MAX_BLOCKED_NS: u64 = 20_000_000;
 
-/// Reads of one poll. A healthy link needs two; a flood is read on at the next cycle.
+/// Maximum number of reads in one poll. A healthy link needs two; the rest is read in the next cycle.
 const MAX_READS: usize = 16;
 
-/// `robot_mode` of an arm that can move.
-const RUNNING: i32 = 7;
-
-/// Bits of `safety_status_bits` under which no program can run: protective, safeguard and emergency stops, violation, fault.
-const STOPPED: u32 = 0b111_1111_0100;
-
-/// A live RTDE session with a UR controller.
+/// An RTDE session with a UR controller.
 #[derive(Debug)]
 pub struct UrLink {
     stream: TcpStream,
@@ -38,15 +33,15 @@ pub struct UrLink {
     gaps: GapMeter,
     token: i32,
     script_version: i32,
-    /// A package that the send buffer took only in part: its rest goes first, or the stream would lose its framing.
+    /// A package of which the send buffer took only a part: the rest is sent first, or the stream would lose its framing.
     unsent: [u8; CommandWriter::PACKAGE],
     unsent_from: usize,
     unsent_to: usize,
     blocked_since_ns: Option<u64>,
-    /// Joint targets of position mode, and when they were last moved on.
+    /// Joint targets of position mode, and when they were last advanced.
     targets: Option<(Joints, u64)>,
-    /// Longest time that one cycle may move them on, ns.
-    most_ns: u64,
+    /// Maximum time by which one cycle advances them, ns.
+    max_advance_ns: u64,
     motion: Motion,
     last: Option<RobotState>,
     now_ns: u64,
@@ -55,13 +50,13 @@ pub struct UrLink {
 }
 
 impl UrLink {
-    /// Connects, shakes hands and waits for the first state. Blocks up to the configured timeout; for an ordinary thread.
+    /// Connects, performs the RTDE handshake and waits for the first state. Blocks up to the configured timeout; for an ordinary thread.
     ///
     /// # Errors
-    /// No connection, an answer that refuses a field (by name), or silence.
+    /// No connection, a refused field (by name), or no answer.
     pub fn connect(config: &UrConfig) -> Result<UrLink, ArmError> {
         match Self::connect_with(config, &STATE_FIELDS) {
-            // The controller's software is from before it told its tool point: the loop does without.
+            // Old controller software does not report the tool point, which is optional.
             Err(ArmError::Session(ClientError::NotFound(field)))
                 if STATE_FIELDS[NEEDED_FIELDS..].contains(&field.to_string().as_str()) =>
             {
@@ -79,7 +74,7 @@ impl UrLink {
         let token = fresh_token();
         let mut link = UrLink {
             stream,
-            // Written once, so that no page is touched for the first time by the command thread.
+            // Written once, so that the command thread never touches a page for the first time.
             framer: Framer::new(vec![1u8; MAX_PACKAGE].into_boxed_slice()),
             session,
             reader,
@@ -92,7 +87,7 @@ impl UrLink {
             unsent_to: 0,
             blocked_since_ns: None,
             targets: None,
-            most_ns: (2e9 / config.cycle_hz.max(1.0)).max(10e6) as u64,
+            max_advance_ns: (2e9 / config.cycle_hz.max(1.0)).max(10e6) as u64,
             motion: config.motion,
             last: None,
             now_ns: 0,
@@ -100,7 +95,7 @@ impl UrLink {
             fault: None,
         };
         let deadline = Instant::now() + config.timeout;
-        link.shake_hands(deadline, config.timeout)?;
+        link.handshake(deadline, config.timeout)?;
         let (recipe, _) = link.session.input(0).ok_or(unknown)?;
         link.writer = CommandWriter::new(recipe, token, config.acceleration);
         link.gaps = GapMeter::new(1.0 / link.session.frequency_hz());
@@ -112,19 +107,19 @@ impl UrLink {
         Ok(link)
     }
 
-    /// Messages of the session, one answer at a time.
-    fn shake_hands(&mut self, deadline: Instant, limit: Duration) -> Result<(), ArmError> {
+    /// The RTDE handshake: sends each request and waits for its answer.
+    fn handshake(&mut self, deadline: Instant, limit: Duration) -> Result<(), ArmError> {
         let mut out = [0u8; 4096];
         while self.session.phase() != Phase::Running {
             if let Some(n) = self.session.transmit(&mut out)? {
                 self.stream.write_all(out.get(..n).unwrap_or_default()).map_err(io)?;
             }
-            // Data merged behind the answer to S stays in the framer for the first poll.
+            // Data that arrived together with the answer to the start request stays in the framer for the first poll.
             while self.session.phase() != Phase::Running
                 && let Some(package) = self.framer.next()?
             {
                 if let Event::Text(text) = self.session.handle(package)? {
-                    crate::log::say(format_args!("controller says: {text}"));
+                    crate::log::message(format_args!("controller message: {text}"));
                 }
             }
             if self.session.phase() == Phase::Running {
@@ -141,14 +136,14 @@ impl UrLink {
             match self.stream.read(self.framer.space()) {
                 Ok(0) => return Err(io(io::ErrorKind::UnexpectedEof.into())),
                 Ok(n) => self.framer.commit(n),
-                Err(e) if retry(&e) => {}
+                Err(e) if is_transient(&e) => {}
                 Err(e) => return Err(io(e)),
             }
         }
         Ok(())
     }
 
-    /// Polls until `done`; false when the deadline came first.
+    /// Polls until `done`; false when the deadline passed first.
     fn wait_until(&mut self, deadline: Instant, done: impl Fn(&Self) -> bool) -> Result<bool, ArmError> {
         while !done(self) {
             if Instant::now() >= deadline {
@@ -166,31 +161,31 @@ impl UrLink {
         Ok(true)
     }
 
-    /// Uploads the control script and waits until it echoes this session's token. The script then waits for the command
-    /// thread's first commands; the arm is idle.
+    /// Uploads the control script and waits until it echoes the session's token. The script then waits for the first commands of
+    /// the command thread; the arm is idle.
     ///
     /// # Errors
-    /// The robot is not ready, another program runs, or the script does not answer.
+    /// The robot is not ready, another program runs, or the script does not start.
     pub fn bring_up(&mut self, config: &UrConfig) -> Result<(), ArmError> {
-        let second = Instant::now() + Duration::from_secs(1);
-        // A script of a session that has just died ends by its watchdog; anything else that runs is not ours to stop.
-        self.wait_until(second, |link| {
-            link.last.is_some_and(|s| s.robot_status_bits & 2 == 0) || link.our_script_waits()
+        let deadline = Instant::now() + Duration::from_secs(1);
+        // The script of a session that was just lost ends by its watchdog. Any other program is not stopped.
+        self.wait_until(deadline, |link| {
+            link.last.is_some_and(|s| s.robot_status_bits & 2 == 0) || link.script_waits()
         })?;
         let Some(state) = self.last else {
             return Err(ArmError::Timeout { what: "robot state", seconds: 1.0 });
         };
-        if state.robot_mode != RUNNING || state.safety_status_bits & STOPPED != 0 {
+        if state.robot_mode != ROBOT_MODE_RUNNING || state.safety_status_bits & SAFETY_STOPPED_BITS != 0 {
             return Err(ArmError::NotReady { mode: state.robot_mode, safety: state.safety_status_bits });
         }
-        if state.robot_status_bits & 2 != 0 && !self.our_script_waits() {
+        if state.robot_status_bits & 2 != 0 && !self.script_waits() {
             return Err(ArmError::ProgramRunning);
         }
         start_script(config, self.token, self.step_s())?;
         let limit = config.timeout;
-        if !self.wait_until(Instant::now() + limit, Self::script_answers)? {
+        if !self.wait_until(Instant::now() + limit, Self::script_echoes_token)? {
             let hint =
-                "look at the pendant's log; the robot must be in Remote Control and its program not paused".to_owned();
+                "see the pendant's log; the robot must be in Remote Control and its program not paused".to_owned();
             return Err(ArmError::NoScript { seconds: limit.as_secs_f64(), hint });
         }
         if self.script_version != SCRIPT_VERSION {
@@ -199,11 +194,11 @@ impl UrLink {
         Ok(())
     }
 
-    fn our_script_waits(&self) -> bool {
+    fn script_waits(&self) -> bool {
         self.script_version == SCRIPT_VERSION && self.last.is_some_and(|s| s.script_state == script_state::WAITING)
     }
 
-    fn script_answers(&self) -> bool {
+    fn script_echoes_token(&self) -> bool {
         self.last.is_some_and(|s| s.script_token == self.token && s.script_state >= script_state::WAITING)
     }
 
@@ -227,7 +222,7 @@ impl UrLink {
         self.last.as_ref()
     }
 
-    /// Takes every whole package out of the framer.
+    /// Handles every complete package in the framer.
     fn take_packages(&mut self, now_ns: u64, poll: &mut LinkPoll) -> Option<LinkFault> {
         loop {
             let package = match self.framer.next() {
@@ -240,7 +235,7 @@ impl UrLink {
                 Ok(_) => continue,
                 Err(e) => return Some(LinkFault::Protocol(e)),
             };
-            // `handle` has checked the length, so the reader always finds its bytes.
+            // `handle` has checked the length, so that the reader always succeeds.
             let Some(state) = self.reader.read(values, now_ns) else { continue };
             self.script_version = self.reader.script_version(values).unwrap_or(0);
             let step = self.gaps.observe(state.timestamp_s);
@@ -256,7 +251,7 @@ impl UrLink {
         }
     }
 
-    /// Everything that the socket holds, bounded by [`MAX_READS`].
+    /// Reads everything from the socket, bounded by [`MAX_READS`].
     fn receive(&mut self, now_ns: u64, poll: &mut LinkPoll) -> Option<LinkFault> {
         for _ in 0..MAX_READS {
             match self.stream.read(self.framer.space()) {
@@ -273,13 +268,13 @@ impl UrLink {
             }
         }
         if poll.packages > 0 {
-            // The kernel drops quick acknowledgement by itself; without it the controller's next package may wait 40 ms.
+            // The kernel resets quick acknowledgement; without it the controller's next package may be delayed by 40 ms.
             let _ = rustix::net::sockopt::set_tcp_quickack(&self.stream, true);
         }
         None
     }
 
-    /// Writes what is unsent; true when nothing is left.
+    /// Writes the unsent bytes; true when none are left.
     fn flush(&mut self) -> Result<bool, LinkFault> {
         while self.unsent_from < self.unsent_to {
             let rest = self.unsent.get(self.unsent_from..self.unsent_to).unwrap_or_default();
@@ -294,7 +289,7 @@ impl UrLink {
         Ok(true)
     }
 
-    /// Joint targets of position mode: the rates integrated from where the controller's own target is.
+    /// Joint targets of position mode: the rates integrated from the controller's own target.
     fn integrate(&mut self, command: &ArmCommand) -> Option<Joints> {
         if self.motion == Motion::Velocity {
             return None;
@@ -305,8 +300,8 @@ impl UrLink {
         }
         let start = self.last.map(|s| s.target_q)?;
         let (mut q, then) = self.targets.unwrap_or((start, self.now_ns));
-        // A late cycle moves the target on by two cycles at most: the arm waits for us, it does not leap.
-        let dt = self.now_ns.saturating_sub(then).min(self.most_ns) as f64 * 1e-9;
+        // A late cycle advances the target by two cycles at most (or 10 ms): the arm waits instead of jumping ahead.
+        let dt = self.now_ns.saturating_sub(then).min(self.max_advance_ns) as f64 * 1e-9;
         for (q, rate) in q.iter_mut().zip(command.rates) {
             *q += rate * dt;
         }
@@ -317,7 +312,7 @@ impl UrLink {
     fn try_send(&mut self, command: &ArmCommand) -> Result<(), LinkFault> {
         let targets = self.integrate(command);
         let command = match (self.motion, command.mode, targets) {
-            // Position mode without a known position: nothing to integrate from.
+            // Position mode without a known position: there is nothing to integrate from.
             (Motion::Position, ArmMode::Velocity, None) => {
                 ArmCommand { mode: ArmMode::Idle, rates: [0.0; 6], ..*command }
             }
@@ -332,14 +327,14 @@ impl UrLink {
                 return Ok(());
             }
             if self.unsent_from == 0 {
-                // Not a byte went: the package can be forgotten, a newer command replaces it.
+                // No byte was sent: the package is discarded, and the next command replaces it.
                 self.unsent_to = 0;
             }
         }
         self.stats.dropped += 1;
         let since = *self.blocked_since_ns.get_or_insert(self.now_ns);
         let blocked = self.now_ns.saturating_sub(since);
-        if blocked >= BLOCKED_NS { Err(LinkFault::SendBlocked(blocked)) } else { Ok(()) }
+        if blocked >= MAX_BLOCKED_NS { Err(LinkFault::SendBlocked(blocked)) } else { Ok(()) }
     }
 }
 
@@ -348,7 +343,7 @@ impl ArmLink for UrLink {
         self.now_ns = now_ns;
         let mut poll = LinkPoll { fault: self.fault, ..LinkPoll::default() };
         if poll.fault.is_none() {
-            // What came in together with the answer to S waits in the framer.
+            // The framer may hold data that arrived together with the answer to the start request.
             let fault = self.take_packages(now_ns, &mut poll);
             poll.fault = fault.or_else(|| self.receive(now_ns, &mut poll));
             self.fault = poll.fault;
@@ -395,7 +390,7 @@ impl ArmLink for UrLink {
     }
 }
 
-fn retry(e: &io::Error) -> bool {
+fn is_transient(e: &io::Error) -> bool {
     matches!(e.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut | io::ErrorKind::Interrupted)
 }
 

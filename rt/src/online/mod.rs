@@ -1,6 +1,7 @@
 //! The on-line stage, one file per arrow of the paper: frames in, gripper pose out.
 
 pub mod acquire;
+mod arm_motion;
 mod content;
 mod frame;
 pub mod interaction;
@@ -16,6 +17,7 @@ pub mod screw;
 mod vision;
 mod vision_cycle;
 
+pub use arm_motion::{ArmMotion, mid_exposure_ns};
 pub use frame::{FrameFaults, FrameLimits, FrameReject, StereoFrame};
 pub use vision::{MarkObservation, Vision, VisionStatus};
 pub use vision_cycle::{VisionCycle, VisionHealth, VisionSettings};
