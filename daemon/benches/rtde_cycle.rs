@@ -1,8 +1,8 @@
 //! Processor time of a 500 Hz cycle of the UR link: `cargo bench -p graspd --bench rtde_cycle [-- SECONDS]`.
 //!
-//! Two alternating loops with the same system calls in the same order (poll, read until it would block, QUICKACK, write): one only moves
-//! bytes, the other is the complete link with framing, session, decoding, gap count and encoding. The peer is a thread that sends a state
-//! every 2 ms; only the processor time of the measured thread counts.
+//! Two alternating loops with the same system calls in the same order (poll, read until it would block, QUICKACK,
+//! write): one only moves bytes, the other is the complete link with framing, session, decoding, gap count and
+//! encoding. The peer is a thread that sends a state every 2 ms; only the processor time of the measured thread counts.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 
 use std::io::{Read, Write};

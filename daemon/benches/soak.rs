@@ -1,9 +1,11 @@
-//! Soak test of the command thread against the mock controller: `cargo bench -p graspd --bench soak -- SECONDS [robot] [ur5]`.
+//! Soak test of the command thread against the mock controller:
+//! `cargo bench -p graspd --bench soak -- SECONDS [robot] [ur5]`.
 //!
-//! The daemon's command thread (command cycle and UR link) swings a wrist over RTDE against `graspd-mock-ur` in a separate process.
-//! Printed: gaps by the controller's clock with their causes (steps that the mock missed because the host stalled, packages that the
-//! mock left out because the client did not read, packages that the client lost); a histogram of the round trip from a command to its
-//! echo; memory and descriptors of both processes over time. Exits with code 1 when the client lost a package or memory grows.
+//! The daemon's command thread (command cycle and UR link) swings a wrist over RTDE against `graspd-mock-ur` in a
+//! separate process. Printed: gaps by the controller's clock with their causes (steps that the mock missed because the
+//! host stalled, packages that the mock left out because the client did not read, packages that the client lost); a
+//! histogram of the round trip from a command to its echo; memory and descriptors of both processes over time. Exits
+//! with code 1 when the client lost a package or memory grows.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 
 #[path = "../tests/cell/wire.rs"]
@@ -145,7 +147,7 @@ fn soak(config: &Config, seconds: f64, mock: u32, record: &Path) -> i32 {
     link.bring_up(&ur).unwrap();
     let period_s = config.threads.period_ns() as f64 * 1e-9;
     let swing: Box<dyn ArmLink> = Box::new(Swing { link, phase: 0.0, period_s });
-    let begun = now_ns();
+    let started = now_ns();
     let (shared, cycle) =
         (Shared::default(), CommandCycle::new(cycle_config(config, Dh::nominal(config.arm.model), false)).unwrap());
     shared.link_ready.put(swing);
@@ -204,7 +206,7 @@ fn soak(config: &Config, seconds: f64, mock: u32, record: &Path) -> i32 {
     let steps: Vec<u64> = entries
         .iter()
         .filter_map(|e| match e {
-            Entry::Step { at_ns, .. } if (begun..ended).contains(at_ns) => Some(*at_ns),
+            Entry::Step { at_ns, .. } if (started..ended).contains(at_ns) => Some(*at_ns),
             _ => None,
         })
         .collect();

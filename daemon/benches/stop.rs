@@ -1,9 +1,9 @@
-//! Time from a stop request to the first decelerating set-point, by every path, under load: `cargo bench -p graspd --bench stop
-//! -- [TRIES]`.
+//! Time from a stop request to the first decelerating set-point, by every path, under load:
+//! `cargo bench -p graspd --bench stop -- [TRIES]`.
 //!
-//! The daemon's log is blocked, clients request the status 1,000 times a second, and two threads use the processors. Stops are measured
-//! in the mock controller's wire record. Tries in which the daemon's cycle missed a deadline, which is the host's doing, are listed both
-//! with the others and separately.
+//! The daemon's log is blocked, clients request the status 1,000 times a second, and two threads use the processors.
+//! Stops are measured in the mock controller's wire record. Tries in which the daemon's cycle missed a deadline, which
+//! is the host's doing, are listed both with the others and separately.
 #![allow(clippy::unwrap_used)] // a failure must panic
 
 #[path = "../tests/cell/mod.rs"]

@@ -1,7 +1,8 @@
-//! The graspd program: configuration, threads, sockets and commands. The mathematics is in `graspd_rt` and `graspd_calib`.
+//! The graspd program: configuration, threads, sockets and commands. The mathematics is in `graspd_rt` and
+//! `graspd_calib`.
 //!
-//! `graspd run` is the real-time daemon (two real-time threads, [`realtime`] and [`threads`]); the other subcommands are ordinary
-//! programs that use the same files and formats.
+//! `graspd run` is the real-time daemon (two real-time threads, [`realtime`] and [`threads`]); the other subcommands
+//! are ordinary programs that use the same files and formats.
 //!
 //! | module | contents |
 //! |---|---|

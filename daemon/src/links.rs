@@ -1,5 +1,5 @@
-//! The link manager: makes the robot link on an ordinary thread, hands it to the command thread, and takes failed links back. It never
-//! arms.
+//! The link manager: makes the robot link on an ordinary thread, hands it to the command thread, and takes failed links
+//! back. It never arms.
 
 use crate::arm::{
     ArmError, ArmLink, MessageListener, MockLimits, MockLink, RecoverTimes, UrConfig, UrLink, backoff_delay,

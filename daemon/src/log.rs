@@ -1,8 +1,8 @@
 //! The daemon's log: a bounded queue of lines, written by a separate thread.
 //!
-//! Logging never waits: a stopped terminal, an unread or closed pipe or a full disk blocks the log thread only. Lines that do not fit
-//! into the queue are dropped and counted; the count is in the status, in telemetry and, once writing works again, in the log itself.
-//! Before [`start`], which the client commands never call, a line is written directly.
+//! Logging never waits: a stopped terminal, an unread or closed pipe or a full disk blocks the log thread only. Lines
+//! that do not fit into the queue are dropped and counted; the count is in the status, in telemetry and, once writing
+//! works again, in the log itself. Before [`start`], which the client commands never call, a line is written directly.
 
 use crate::realtime::now_ns;
 use crossbeam::queue::ArrayQueue;
@@ -118,8 +118,8 @@ pub fn flush(limit: Duration) {
     }
 }
 
-/// Sends panic messages to the log: the standard hook writes to standard error on the panicking thread, which may be a real-time
-/// thread.
+/// Sends panic messages to the log: the standard hook writes to standard error on the panicking thread, which may be a
+/// real-time thread.
 pub fn log_panics() {
     std::panic::set_hook(Box::new(|info| {
         let thread = std::thread::current();
@@ -149,7 +149,8 @@ fn write_forever(log: &Log) {
     }
 }
 
-/// Writes all bytes, without the locks and buffers of the standard library: a blocked write must not hold a lock that the exit needs.
+/// Writes all bytes, without the locks and buffers of the standard library: a blocked write must not hold a lock that
+/// the exit needs.
 fn put(stream: Stream, bytes: &[u8]) -> Result<(), Errno> {
     match stream {
         Stream::Out => put_to(&std::io::stdout(), bytes),

@@ -1,4 +1,5 @@
-//! Configurations that are refused, and requests that a configured daemon refuses: real processes and the files they read.
+//! Configurations that are refused, and requests that a configured daemon refuses: real processes and the files they
+//! read.
 #![cfg(feature = "demo")]
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 
@@ -57,13 +58,13 @@ impl Files {
     fn refused(&self, config: &str, parts: &[&str]) {
         std::fs::write(self.world.folder.join("graspd.toml"), config).unwrap();
         for verb in ["check", "run"] {
-            let begun = Instant::now();
+            let started = Instant::now();
             let out = graspd(&self.world.folder, &[verb, "--config", "graspd.toml"]);
             assert_eq!(out.status.code(), Some(3), "{verb}: {}", output(&out));
             for part in parts {
                 assert!(output(&out).contains(part), "{verb} does not print {part}: {}", output(&out));
             }
-            assert!(begun.elapsed() < Duration::from_secs(5), "{verb} has started something");
+            assert!(started.elapsed() < Duration::from_secs(5), "{verb} has started something");
         }
     }
 

@@ -1,7 +1,8 @@
-//! One of the three processes is killed at a random time of the motion: the arm stops, the others stay alive and report the cause, and a
-//! restarted process does not move the arm.
+//! One of the three processes is killed at a random time of the motion: the arm stops, the others stay alive and report
+//! the cause, and a restarted process does not move the arm.
 //!
-//! One round by default; `GRASPD_KILLS=30 cargo test --release -p graspd --test kill_any_process -- --nocapture` for more.
+//! One round by default; `GRASPD_KILLS=30 cargo test --release -p graspd --test kill_any_process -- --nocapture` for
+//! more.
 #![cfg(feature = "demo")]
 #![allow(clippy::unwrap_used)] // a failure must panic
 

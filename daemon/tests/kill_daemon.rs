@@ -1,8 +1,9 @@
-//! SIGKILL and SIGSTOP of the real daemon at random times of the motion: the arm starts to decelerate within 50 ms and comes to rest, by
-//! the mock's wire record and clock, and a daemon that is continued reports the cause and does not move the arm.
+//! SIGKILL and SIGSTOP of the real daemon at random times of the motion: the arm starts to decelerate within 50 ms and
+//! comes to rest, by the mock's wire record and clock, and a daemon that is continued reports the cause and does not
+//! move the arm.
 //!
-//! Two of each by default; `GRASPD_KILLS=100 cargo test --release -p graspd --test kill_daemon -- --nocapture` for the full run,
-//! `GRASPD_MOTION=position` for the same with `servoj`.
+//! Two of each by default; `GRASPD_KILLS=100 cargo test --release -p graspd --test kill_daemon -- --nocapture` for the
+//! full run, `GRASPD_MOTION=position` for the same with `servoj`.
 #![cfg(feature = "demo")]
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 
@@ -36,8 +37,8 @@ struct Stop {
     ramp_s: f64,
 }
 
-/// Measures the stop after the last heartbeat of `entries`. An error that begins with a capital letter is a failure; any other says that
-/// the arm was not in motion.
+/// Measures the stop after the last heartbeat of `entries`. An error that begins with a capital letter is a failure;
+/// any other says that the arm was not in motion.
 fn judge(entries: &[Entry]) -> Result<Stop, String> {
     let mut last = (None, 0);
     for (i, e) in entries.iter().enumerate() {
@@ -162,7 +163,8 @@ impl Tally {
     }
 }
 
-/// Continues a stopped daemon: the arm stays at rest, and the cause has a code. Then the daemon is brought back to idle.
+/// Continues a stopped daemon: the arm stays at rest, and the cause has a code. Then the daemon is brought back to
+/// idle.
 fn resume(world: &World, daemon: &Process, wire: &mut Wire, tally: &mut Tally) {
     daemon.signal(Signal::CONT);
     std::thread::sleep(Duration::from_millis(500));

@@ -1,4 +1,5 @@
-//! A camera that is knocked while real processes servo: the arm stops, or does not start, and never converges next to the part.
+//! A camera that is knocked while real processes servo: the arm stops, or does not start, and never converges next to
+//! the part.
 #![cfg(feature = "demo")]
 #![allow(clippy::unwrap_used)] // a failure must panic
 
@@ -37,7 +38,8 @@ fn a_knocked_camera_stops_the_arm_and_invalidates_its_plan() {
         }
         println!("{knock}: {state}: {cause} | {marks}");
         if state == "converged" {
-            // The knock takes a second to become visible and may come after convergence. Then the arm does not stay converged.
+            // The knock takes a second to become visible and may come after convergence. Then the arm does not stay
+            // converged.
             std::thread::sleep(Duration::from_secs(2));
             [state, cause, marks] = status(&world);
             println!("{knock}: {state}: {cause} | {marks}");

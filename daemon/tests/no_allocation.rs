@@ -1,5 +1,5 @@
-//! The daemon in this process, under a counting allocator: from the first servoing cycle to the last, through every external fault, the
-//! command thread and the vision thread neither allocate nor free heap memory.
+//! The daemon in this process, under a counting allocator: from the first servoing cycle to the last, through every
+//! external fault, the command thread and the vision thread neither allocate nor free heap memory.
 //!
 //! `rt/tests/closed_loop` does the same for internal faults.
 #![cfg(feature = "demo")]
@@ -64,8 +64,8 @@ fn count() {
 
 struct Counting;
 
-// SAFETY: every call goes to the system's allocator unchanged; `count` touches atomics and a const-initialised thread local, and its own
-// allocations (once, for the backtrace) run with the thread marked so that they are not counted.
+// SAFETY: every call goes to the system's allocator unchanged; `count` touches atomics and a const-initialised thread
+// local, and its own allocations (once, for the backtrace) run with the thread marked so that they are not counted.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         count();
@@ -207,15 +207,16 @@ fn the_real_time_threads_do_not_use_the_heap_while_servoing_or_stopping() {
         let mut seen = String::new();
         // A stalled host may cause another fault before the injected one; then the row is repeated.
         for _ in 0..4 {
-            // A fault of the robot's link affects the scene's link as well: its images then lag behind the encoders, which looks like a
-            // moved camera. An operator who knows the reason sends the set-point again.
+            // A fault of the robot's link affects the scene's link as well: its images then lag behind the encoders,
+            // which looks like a moved camera. An operator who knows the reason sends the set-point again.
             let until = Instant::now() + Duration::from_secs(30);
             while let Err(e) = operator.ask(Verb::Servo, b"") {
                 assert!(Instant::now() < until, "{e}");
                 if e.contains("camera was moved") {
                     let _ = operator.ask(Verb::Setpoint, &plan);
                 }
-                // A stalled host may stop the arm by its watchdog before the fault is injected; that is cleared like any other fault.
+                // A stalled host may stop the arm by its watchdog before the fault is injected; that is cleared like
+                // any other fault.
                 restore(&operator, &world, &mock, &scene);
                 let _ = operator.ask(Verb::Arm, b"");
                 std::thread::sleep(Duration::from_millis(100));
@@ -233,7 +234,8 @@ fn the_real_time_threads_do_not_use_the_heap_while_servoing_or_stopping() {
             let stopped = |s: &str, c: &str| s == "fault" || (s == "armed" && c.starts_with("H-"));
             seen = operator.until("stopped", Duration::from_secs(6), stopped).unwrap_or_default();
             println!("{line}: {seen}");
-            // Recovery, reset and the return to tracking are counted as well: none of it is work of the real-time threads.
+            // Recovery, reset and the return to tracking are counted as well: none of it is work of the real-time
+            // threads.
             restore(&operator, &world, &mock, &scene);
             if seen.contains(code) {
                 break;

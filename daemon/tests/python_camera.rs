@@ -1,5 +1,5 @@
-//! A camera driver in another language: `shm/python/publish_stereo.py`, with iceoryx2 from PyPI in a virtual environment, publishes a pair
-//! that shows the gripper; the daemon finds the marks and can be armed.
+//! A camera driver in another language: `shm/python/publish_stereo.py`, with iceoryx2 from PyPI in a virtual
+//! environment, publishes a pair that shows the gripper; the daemon finds the marks and can be armed.
 #![cfg(feature = "demo")]
 #![allow(clippy::unwrap_used)] // a failure must panic
 

@@ -1,5 +1,5 @@
-//! The UR link and the control script against the mock controller, over loopback TCP: identity, upload, motion, a heartbeat that stops,
-//! a protective stop and the recovery from it. Every wait is bounded.
+//! The UR link and the control script against the mock controller, over loopback TCP: identity, upload, motion, a
+//! heartbeat that stops, a protective stop and the recovery from it. Every wait is bounded.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 #![cfg(feature = "demo")]
 

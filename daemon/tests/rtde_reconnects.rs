@@ -1,8 +1,9 @@
-//! The link manager against a controller behind a hostile connection: resets and closes at random points of the handshake, wrong sizes,
-//! single bytes, slow bytes, silence, refused inputs, a peer that never reads. In all cases: no panic, no leaked memory or descriptors,
-//! a reason for each failure, bounded time, and no command to move.
+//! The link manager against a controller behind a hostile connection: resets and closes at random points of the
+//! handshake, wrong sizes, single bytes, slow bytes, silence, refused inputs, a peer that never reads. In all cases: no
+//! panic, no leaked memory or descriptors, a reason for each failure, bounded time, and no command to move.
 //!
-//! Sixty connections by default, `GRASPD_RECONNECTS=1000 cargo test --release -p graspd --test rtde_reconnects -- --nocapture` for all.
+//! Sixty connections by default, `GRASPD_RECONNECTS=1000 cargo test --release -p graspd --test rtde_reconnects --
+//! --nocapture` for all.
 #![cfg(feature = "demo")]
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 

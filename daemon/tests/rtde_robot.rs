@@ -1,5 +1,5 @@
-//! The UR link and the recovery against the mock controller: CB3 at 125 Hz, protocol version 1, inputs that are held or unknown, outputs
-//! of the gripper, every refusal of a recovery, and the controller's messages about a stop.
+//! The UR link and the recovery against the mock controller: CB3 at 125 Hz, protocol version 1, inputs that are held or
+//! unknown, outputs of the gripper, every refusal of a recovery, and the controller's messages about a stop.
 #![cfg(feature = "demo")]
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 
@@ -216,13 +216,13 @@ fn every_refusal_of_a_recovery_names_its_fix() {
 fn messages_name_the_cause_of_a_stop_and_a_recovery_closes_popups() {
     let (mut mock, config) = mock("ur5e", 0.05);
     let mut listener = MessageListener::new(&config);
-    let receive_message = |listener: &mut MessageListener, wanted: MessageKind| {
+    let receive_message = |listener: &mut MessageListener, expected: MessageKind| {
         let until = Instant::now() + LIMIT;
         loop {
-            if let Some(message) = listener.poll().into_iter().find(|m| m.kind == wanted) {
+            if let Some(message) = listener.poll().into_iter().find(|m| m.kind == expected) {
                 return message.text;
             }
-            assert!(Instant::now() < until, "no message of kind {wanted:?}");
+            assert!(Instant::now() < until, "no message of kind {expected:?}");
             std::thread::sleep(Duration::from_millis(5));
         }
     };

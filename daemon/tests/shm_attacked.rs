@@ -1,7 +1,8 @@
-//! Shared memory that is damaged while the daemon moves the arm, and attacks by another local user: the stop keeps working.
+//! Shared memory that is damaged while the daemon moves the arm, and attacks by another local user: the stop keeps
+//! working.
 //!
-//! Each test runs in a mount namespace with its own `/dev/shm`, which it can fill and empty. That and the second account need root;
-//! without root the tests print that they are skipped.
+//! Each test runs in a mount namespace with its own `/dev/shm`, which it can fill and empty. That and the second
+//! account need root; without root the tests print that they are skipped.
 #![cfg(feature = "demo")]
 #![allow(clippy::unwrap_used)] // a failure must panic
 
@@ -110,8 +111,8 @@ fn damaged_shared_memory_stops_a_moving_arm() {
         let answer = request_stop(&names);
         std::thread::sleep(Duration::from_millis(700));
         let mut entries = cell.wire.read();
-        // A live daemon takes the stop immediately. If the kernel killed it for an access to missing memory (SIGBUS), the control script
-        // stops the arm after its heartbeat timeout, and the daemon's last set-point was not a stop.
+        // A live daemon takes the stop immediately. If the kernel killed it for an access to missing memory (SIGBUS),
+        // the control script stops the arm after its heartbeat timeout, and the daemon's last set-point was not a stop.
         let alive = matches!(answer, StopAnswer::Socket { taken: true, .. });
         if alive {
             stops::judge(&entries, asked).unwrap().check(&format!("shared memory {kind}, socket"));
@@ -126,9 +127,9 @@ fn damaged_shared_memory_stops_a_moving_arm() {
             other => assert!(kind != "deleted" && other != Some(0), "{kind}: {other:?}\n{}", cell.world.log()),
         }
         // Without a daemon the command fails within bounded time.
-        let begun = Instant::now();
+        let started = Instant::now();
         assert!(!cell.world.verb(&["stop"]).0);
-        assert!(begun.elapsed() < Duration::from_secs(5), "{kind}: {:?}", begun.elapsed());
+        assert!(started.elapsed() < Duration::from_secs(5), "{kind}: {:?}", started.elapsed());
         // A new daemon in the damaged folder works or ends with an error; it does not hang.
         let left = cell.world.path("graspd.toml");
         cell.scene = None;

@@ -1,5 +1,5 @@
-//! Every stop path and every end of the daemon, on real processes: with the log blocked, closed or on a full disk, by socket, signal
-//! and verb, and with a second publisher. Stops are measured in the mock controller's wire record.
+//! Every stop path and every end of the daemon, on real processes: with the log blocked, closed or on a full disk, by
+//! socket, signal and verb, and with a second publisher. Stops are measured in the mock controller's wire record.
 #![cfg(feature = "demo")]
 #![allow(clippy::unwrap_used)] // a failure must panic
 
@@ -78,12 +78,12 @@ fn lines_beyond_the_capacity_of_the_log_are_dropped_and_counted() {
         .stderr(end)
         .spawn()
         .unwrap();
-    let begun = Instant::now();
+    let started = Instant::now();
     let status = loop {
         if let Some(status) = child.try_wait().unwrap() {
             break status;
         }
-        if begun.elapsed() > Duration::from_secs(10) {
+        if started.elapsed() > Duration::from_secs(10) {
             child.kill().unwrap();
             panic!("logging waits for an unread pipe");
         }
@@ -100,11 +100,11 @@ fn many_lines_helper() {
         return;
     }
     graspd::log::start().unwrap();
-    let begun = Instant::now();
+    let started = Instant::now();
     for n in 0..5000 {
         graspd::log::message(format_args!("line {n}"));
     }
-    assert!(begun.elapsed() < Duration::from_millis(500), "{:?}", begun.elapsed());
+    assert!(started.elapsed() < Duration::from_millis(500), "{:?}", started.elapsed());
     graspd::log::flush(Duration::from_millis(600));
     let lost = graspd::log::lost();
     // 1024 lines wait, and the log thread may be writing one.
@@ -135,8 +135,8 @@ fn signals_and_the_command_line_stop_the_arm_and_end_the_daemon() {
         println!("graspd stop as a program: {:.1} ms", stop.latency_ms);
     }
     assert!(cell.world.state().1.contains("the stop socket"));
-    // Without the socket the signal goes to the process that holds the lock. The daemon then ends, because clients can no longer
-    // find it.
+    // Without the socket the signal goes to the process that holds the lock. The daemon then ends, because clients can
+    // no longer find it.
     let names = cell.names();
     let socket = names.root().join(graspd::stop::socket_name("kill"));
     let (stop, _) = cell.stop(&mut |_| {
@@ -152,9 +152,9 @@ fn signals_and_the_command_line_stop_the_arm_and_end_the_daemon() {
         end_by(&mut cell, &mut daemon, signal, name);
     }
     // Without a daemon the command fails quickly.
-    let begun = Instant::now();
+    let started = Instant::now();
     assert!(!cell.world.verb(&["stop"]).0);
-    assert!(begun.elapsed() < Duration::from_secs(5), "{:?}", begun.elapsed());
+    assert!(started.elapsed() < Duration::from_secs(5), "{:?}", started.elapsed());
     cell.check_limits();
     cell.clean();
 }
@@ -206,7 +206,8 @@ fn a_second_publisher_stops_the_arm() {
     cell.clean();
 }
 
-/// Four clients send requests continuously, and the log is blocked: a connected console stops by its verb, other clients by the socket.
+/// Four clients send requests continuously, and the log is blocked: a connected console stops by its verb, other
+/// clients by the socket.
 #[test]
 fn many_requests_a_second_do_not_delay_a_stop() {
     let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);

@@ -46,21 +46,21 @@ impl Dashboard {
         }
     }
 
-    /// Repeats a command every 0.1 s until the answer contains `wanted`.
+    /// Repeats a command every 0.1 s until the answer contains `expected`.
     ///
     /// # Errors
     /// The last answer, with `fix`, when `limit` has passed.
     pub fn wait_for(
         &mut self,
         command: &'static str,
-        wanted: &str,
+        expected: &str,
         limit: Duration,
         fix: &'static str,
     ) -> Result<String, ArmError> {
         let start = Instant::now();
         loop {
             let answer = self.ask(command)?;
-            if answer.to_ascii_uppercase().contains(wanted) {
+            if answer.to_ascii_uppercase().contains(expected) {
                 return Ok(answer);
             }
             if start.elapsed() >= limit {

@@ -5,8 +5,8 @@ use std::fmt;
 use graspd_rt::arm::{ArmCommand, RobotState};
 use graspd_rt::rtde::{ClientError, ClockStep, FrameError};
 
-/// Why a link has failed. Latched: a failed link never moves an arm again. A new link is made on an ordinary thread and starts
-/// unarmed.
+/// Why a link has failed. Latched: a failed link never moves an arm again. A new link is made on an ordinary thread and
+/// starts unarmed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum LinkFault {
     /// The controller closed the connection.
@@ -70,13 +70,14 @@ pub struct LinkStats {
 
 /// A link to an arm, as the command thread uses it.
 ///
-/// No method except [`ArmLink::wait`] blocks, and none allocates or takes a lock. Time is CLOCK_MONOTONIC in nanoseconds, given by the
-/// caller.
+/// No method except [`ArmLink::wait`] blocks, and none allocates or takes a lock. Time is CLOCK_MONOTONIC in
+/// nanoseconds, given by the caller.
 pub trait ArmLink: Send {
     /// Receives everything that has arrived.
     fn poll(&mut self, now_ns: u64) -> LinkPoll;
 
-    /// Sends one command. With a full send buffer the command is dropped and counted; after 20 ms of that the link fails.
+    /// Sends one command. With a full send buffer the command is dropped and counted; after 20 ms of that the link
+    /// fails.
     fn send(&mut self, command: &ArmCommand) -> Result<(), LinkFault>;
 
     /// The session token that the control script must echo in [`RobotState::script_token`].
@@ -91,7 +92,8 @@ pub trait ArmLink: Send {
     /// Why it has ended, if it has.
     fn fault(&self) -> Option<LinkFault>;
 
-    /// Waits for the robot's next package until `deadline_ns` at the latest; true when data arrived. With the robot as the clock, a
-    /// cycle waits for the package, computes and sends, and the command takes effect in the robot's next step. The only call that sleeps.
+    /// Waits for the robot's next package until `deadline_ns` at the latest; true when data arrived. With the robot as
+    /// the clock, a cycle waits for the package, computes and sends, and the command takes effect in the robot's next
+    /// step. The only call that sleeps.
     fn wait(&mut self, deadline_ns: u64) -> bool;
 }

@@ -1,6 +1,7 @@
 //! Robot messages of the primary interface: why the controller stopped, what the pendant shows, why a program failed.
 //!
-//! A robot message (package type 20) is `u64 time, i8 source, u8 kind` and a body that depends on the kind. Unknown kinds are skipped.
+//! A robot message (package type 20) is `u64 time, i8 source, u8 kind` and a body that depends on the kind. Unknown
+//! kinds are skipped.
 
 use std::io::{self, Read};
 use std::net::TcpStream;
@@ -43,8 +44,8 @@ pub enum MessageKind {
     Program,
 }
 
-/// Reads the body of a robot message, without the five bytes of its header; `None` for a kind that does not matter to an operator and
-/// for a body that is too short.
+/// Reads the body of a robot message, without the five bytes of its header; `None` for a kind that does not matter to
+/// an operator and for a body that is too short.
 pub fn parse_message(body: &[u8]) -> Option<RobotMessage> {
     let (&kind, body) = body.get(9..)?.split_first()?;
     let int = |at: usize| body.get(at..)?.first_chunk::<4>().map(|b| i32::from_be_bytes(*b));
@@ -110,7 +111,8 @@ impl MessageListener {
         MessageListener { config, stream: None, bytes: Vec::new(), next_try: Instant::now() }
     }
 
-    /// The messages that arrived since the last call. Does not wait, except up to 0.3 s for an attempt to connect every 3 s.
+    /// The messages that arrived since the last call. Does not wait, except up to 0.3 s for an attempt to connect every
+    /// 3 s.
     pub fn poll(&mut self) -> Vec<RobotMessage> {
         let mut messages = Vec::new();
         if self.receive(&mut messages).is_err() {

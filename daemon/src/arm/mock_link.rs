@@ -37,7 +37,8 @@ impl MockLimits {
 /// Maximum number of steps in one poll; in a longer pause of the caller's clock the arm's clock pauses as well.
 const MAX_STEPS: u32 = 500;
 
-/// A link to the simulated arm: joint rates with acceleration limit and lag, states and faults of the control script, no kinematics.
+/// A link to the simulated arm: joint rates with acceleration limit and lag, states and faults of the control script,
+/// no kinematics.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MockLink {
     limits: MockLimits,

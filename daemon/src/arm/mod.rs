@@ -1,7 +1,8 @@
-//! Links to an arm: the [`ArmLink`] trait, its implementation for a UR controller over TCP, and one for an arm in the process.
+//! Links to an arm: the [`ArmLink`] trait, its implementation for a UR controller over TCP, and one for an arm in the
+//! process.
 //!
-//! The command thread uses [`ArmLink`] only: poll for robot state, send a command; neither blocks nor allocates. Calls that may block
-//! run on ordinary threads: [`UrLink::connect`], [`start_script`], [`recover`], [`read_identity`].
+//! The command thread uses [`ArmLink`] only: poll for robot state, send a command; neither blocks nor allocates. Calls
+//! that may block run on ordinary threads: [`UrLink::connect`], [`start_script`], [`recover`], [`read_identity`].
 
 mod backoff;
 mod dashboard;

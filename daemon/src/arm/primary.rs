@@ -1,7 +1,7 @@
 //! Reader of the primary interface: the arm's type and its calibrated kinematics.
 //!
-//! Framing: `i32 size` (including this field), `u8 type`. A robot-state package (16) is a sequence of sub-packages with the same
-//! framing; unknown sub-packages and unread tails are skipped.
+//! Framing: `i32 size` (including this field), `u8 type`. A robot-state package (16) is a sequence of sub-packages with
+//! the same framing; unknown sub-packages and unread tails are skipped.
 
 use std::io::Read;
 use std::time::{Duration, Instant};
@@ -18,7 +18,8 @@ const KINEMATICS: u8 = 5;
 const CONFIGURATION: u8 = 6;
 /// Maximum size of a package, bytes; no controller sends larger ones.
 const MAX_PACKAGE_BYTES: usize = 1 << 16;
-/// Maximum distance between the flange positions of an arm's calibrated table and its model's, m. Different models are farther apart.
+/// Maximum distance between the flange positions of an arm's calibrated table and its model's, m. Different models are
+/// farther apart.
 pub const MAX_FLANGE_DISTANCE_M: f64 = 0.03;
 
 /// The arm that the controller reports.
@@ -71,7 +72,8 @@ fn doubles(bytes: &[u8], at: usize) -> Option<[f64; 6]> {
     out.iter().all(|v| v.is_finite()).then_some(out)
 }
 
-/// Reads robot type and kinematics from a robot-state body into `known`; what the body does not contain is left as it is.
+/// Reads robot type and kinematics from a robot-state body into `known`; what the body does not contain is left as it
+/// is.
 pub fn parse_identity(body: &[u8], known: &mut (Option<i32>, Option<Dh>)) {
     for (kind, body) in SubPackages::new(body) {
         match kind {
@@ -174,8 +176,9 @@ pub fn check_kinematics(identity: &Identity, dh: &Dh) -> Result<(), ArmError> {
     Ok(())
 }
 
-/// Maximum distance between the flange positions of two tables over three configurations, m. Single parameters of calibrated tables
-/// differ by metres (parallel axes) and flange positions by millimetres, so that only the flange can be compared.
+/// Maximum distance between the flange positions of two tables over three configurations, m. Single parameters of
+/// calibrated tables differ by metres (parallel axes) and flange positions by millimetres, so that only the flange can
+/// be compared.
 pub fn flange_distance(a: &Dh, b: &Dh) -> f64 {
     let configurations = [[0.0; 6], [0.5, -1.2, 1.0, -0.7, 1.3, 0.2], [-1.0, -0.4, -1.5, 0.9, -1.1, 2.0]];
     configurations.iter().fold(0.0, |max: f64, q| {

@@ -30,8 +30,8 @@ impl Default for RecoverTimes {
     }
 }
 
-/// Recovers the controller and uploads the control script with `token`: [`walk_out`], then [`start_script`] for the controller's
-/// step. The arm ends idle: the script waits for the handshake, and nothing is armed.
+/// Recovers the controller and uploads the control script with `token`: [`walk_out`], then [`start_script`] for the
+/// controller's step. The arm ends idle: the script waits for the handshake, and nothing is armed.
 ///
 /// # Errors
 /// The first step that the controller refuses, with what to do.
@@ -42,11 +42,11 @@ pub fn recover(config: &UrConfig, token: i32, mut report: impl FnMut(&RecoverSte
     Ok(())
 }
 
-/// Brings the robot to mode running through the dashboard: close popups, unlock a protective stop, power on, release the brakes,
-/// stop a program that still runs. Returns the controller's step, s.
+/// Brings the robot to mode running through the dashboard: close popups, unlock a protective stop, power on, release
+/// the brakes, stop a program that still runs. Returns the controller's step, s.
 ///
-/// Called only on an operator's request. Emergency stops, safeguards and safety faults are reported, never cleared: they have to be
-/// cleared at the robot.
+/// Called only on an operator's request. Emergency stops, safeguards and safety faults are reported, never cleared:
+/// they have to be cleared at the robot.
 ///
 /// # Errors
 /// The first step that the controller refuses, with what to do.
@@ -77,15 +77,16 @@ pub fn walk_out(
         }
     }
     power_up(&mut dashboard, times.power_up, &mut done)?;
-    // A running program (the script of a lost session, or another one) blocks the control script; the operator asked for a recovery.
+    // A running program (the script of a lost session, or another one) blocks the control script; the operator asked
+    // for a recovery.
     if dashboard.ask("running")?.to_ascii_lowercase().contains("true") {
         done("stop", dashboard.demand("stop", &["Stopped"], "stop the program on the pendant")?);
     }
     Ok(step_s)
 }
 
-/// The controller's step, s, from its software version: 125 Hz with PolyScope 3 (CB3), 500 Hz with later versions. Without a version
-/// in the answer, from the configured model.
+/// The controller's step, s, from its software version: 125 Hz with PolyScope 3 (CB3), 500 Hz with later versions.
+/// Without a version in the answer, from the configured model.
 fn controller_step(config: &UrConfig, dashboard: &mut Dashboard) -> Result<f64, ArmError> {
     let answer = dashboard.ask("PolyscopeVersion")?;
     let major = answer.split(|c: char| !c.is_ascii_digit()).find_map(|n| n.parse::<u32>().ok());

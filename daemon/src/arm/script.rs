@@ -9,7 +9,8 @@ use super::ur_config::{ArmError, Port, UrConfig};
 /// The script with its {{...}} placeholders; docs/RTDE-REGISTERS.md describes it.
 const TEMPLATE: &str = include_str!("../../dist/graspd_control.script");
 
-/// Maximum distance of a joint target from the joint in position mode, rad: the lag of `servoj` at full speed, with a margin.
+/// Maximum distance of a joint target from the joint in position mode, rad: the lag of `servoj` at full speed, with a
+/// margin.
 const MAX_POSITION_STEP_RAD: f64 = 0.25;
 
 /// Time that a new script waits for the command thread, s.
@@ -34,7 +35,8 @@ pub fn render(config: &UrConfig, token: i32, step_s: f64) -> Result<String, ArmE
     positive("stop acceleration", config.stop_acceleration, 40.0)?;
     positive("loop.rate_hz", config.cycle_hz, 1000.0)?;
     positive("arm.watchdog_ms", config.watchdog_ms, 1000.0)?;
-    // The script's heartbeat timeout ends before the controller's watchdog, and not before two and a half cycles of a slow loop.
+    // The script's heartbeat timeout ends before the controller's watchdog, and not before two and a half cycles of a
+    // slow loop.
     let patience_s = (0.8e-3 * config.watchdog_ms).max(2.5 / config.cycle_hz);
     let watchdog_s = (config.watchdog_ms * 1e-3).max(patience_s + 2.0 * step_s);
     let limits: Vec<String> = config.speed_limits.iter().map(|v| format!("{v:.6}")).collect();
@@ -53,15 +55,15 @@ pub fn render(config: &UrConfig, token: i32, step_s: f64) -> Result<String, ArmE
     Ok(filled.into_iter().fold(TEMPLATE.to_owned(), |text, (key, value)| text.replace(key, &value)))
 }
 
-/// Uploads the control script to the secondary interface. It replaces a running program and waits for the command thread's
-/// handshake; the arm does not move.
+/// Uploads the control script to the secondary interface. It replaces a running program and waits for the command
+/// thread's handshake; the arm does not move.
 ///
 /// # Errors
 /// No connection, local control, or a setting that is out of range.
 pub fn start_script(config: &UrConfig, token: i32, step_s: f64) -> Result<(), ArmError> {
     let text = render(config, token, step_s)?;
-    // In local control an e-Series accepts the bytes and drops them. CB3 does not know the command; a controller without a
-    // dashboard (PolyScope X) cannot be asked.
+    // In local control an e-Series accepts the bytes and drops them. CB3 does not know the command; a controller
+    // without a dashboard (PolyScope X) cannot be asked.
     if let Ok(mut dashboard) = Dashboard::open(config)
         && dashboard.ask("is in remote control").is_ok_and(|answer| answer.trim().eq_ignore_ascii_case("false"))
     {
@@ -78,8 +80,8 @@ pub fn stop_script(config: &UrConfig) -> Result<(), ArmError> {
     upload(config, &format!("def graspd_stop():\n  stopj({:.3})\nend\n", config.stop_acceleration))
 }
 
-/// Sends a script. The connection is read for up to 0.3 s before it is closed: closing with unread data in the receive buffer
-/// resets it, and the reset can discard the script.
+/// Sends a script. The connection is read for up to 0.3 s before it is closed: closing with unread data in the receive
+/// buffer resets it, and the reset can discard the script.
 fn upload(config: &UrConfig, text: &str) -> Result<(), ArmError> {
     let fail = |source| ArmError::Io { service: Port::Secondary, source };
     let mut stream = config.open(Port::Secondary)?;

@@ -1,6 +1,7 @@
 //! The controller's status numbers: what they mean, and which of them stop the arm.
 
-/// Bits of `safety_status_bits` under which no program can run: protective, safeguard and emergency stops, violation, fault.
+/// Bits of `safety_status_bits` under which no program can run: protective, safeguard and emergency stops, violation,
+/// fault.
 pub const SAFETY_STOPPED_BITS: u32 = 0b111_1111_0100;
 
 /// The text for a safety mode, as robot messages carry it.

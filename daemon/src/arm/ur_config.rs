@@ -172,7 +172,7 @@ pub enum ArmError {
         expected: i32,
     },
     /// The arm is another model.
-    #[error("the configuration says {expected}, but the controller reports {found}; set arm.model")]
+    #[error("arm.model is {expected}, but the controller reports {found}; set arm.model")]
     WrongModel {
         /// From the configuration.
         expected: &'static str,
@@ -210,8 +210,8 @@ pub enum ArmError {
     },
 }
 
-/// A session token that differs from those of earlier sessions, made from the time and the process id. Never 0, the value of unused
-/// registers.
+/// A session token that differs from those of earlier sessions, made from the time and the process id. Never 0, the
+/// value of unused registers.
 pub fn fresh_token() -> i32 {
     let nanos = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_nanos() as u64);
     let mixed = (nanos ^ u64::from(std::process::id()).rotate_left(40)).wrapping_mul(0x9e37_79b9_7f4a_7c15);

@@ -185,8 +185,9 @@ pub struct PlanArgs {
     /// Maximum standard deviation of the axis, degrees [default: 1, for a mesh 2]
     #[arg(long, value_name = "DEG")]
     pub tolerance_deg: Option<f64>,
-    /// Present pose of the gripper in the left camera's frame: a pose file, or X,Y,Z,RX,RY,RZ (metres, rotation vector in
-    /// radians). The plan checks the visibility along the path, and chooses angles that the marks leave open by the smallest turn
+    /// Present pose of the gripper in the left camera's frame: a pose file, or X,Y,Z,RX,RY,RZ (metres, rotation vector
+    /// in radians). The plan checks the visibility along the path, and chooses angles that the marks leave open by the
+    /// smallest turn
     #[arg(long, value_name = "POSE", allow_hyphen_values = true)]
     pub present: Option<String>,
     /// Maximum turn from the present pose, degrees

@@ -56,8 +56,8 @@ fn show(args: &ClientArgs, answer: &Answer) {
     }
 }
 
-/// `graspd stop`: by the stop socket, else by a signal; over shared memory only where both fail. It reads only the cell and the
-/// shared-memory root from the configuration: an invalid file must not prevent a stop.
+/// `graspd stop`: by the stop socket, else by a signal; over shared memory only where both fail. It reads only the cell
+/// and the shared-memory root from the configuration: an invalid file must not prevent a stop.
 ///
 /// # Errors
 /// No daemon was found, or its command thread does not take the stop.

@@ -37,7 +37,8 @@ pub struct MeshArgs {
     /// The arm's joints at the present pose, radians, base to wrist 3: with --present they give the pose of the rig
     #[arg(long, value_name = "Q1,...,Q6", requires = "arm", allow_hyphen_values = true)]
     pub joints: Option<String>,
-    /// Instead: pose of the arm's base in the left camera's frame, as a pose file with left_from_base, or X,Y,Z,RX,RY,RZ
+    /// Instead: pose of the arm's base in the left camera's frame, as a pose file with left_from_base, or
+    /// X,Y,Z,RX,RY,RZ
     #[arg(long, value_name = "POSE", requires = "arm", allow_hyphen_values = true)]
     pub base: Option<String>,
     /// Only list the handles, ranked, with the reason for each that is dropped; write nothing

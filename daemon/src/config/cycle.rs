@@ -4,14 +4,15 @@ use super::settings::Config;
 use graspd_rt::arm::Dh;
 use graspd_rt::cycle::{CycleConfig, CycleSettings, WatchSettings};
 
-/// Minimum age at which the state of a CB3 controller counts as stale, ns: three and a half of its 8 ms steps, so that one missing
-/// package is not a fault.
+/// Minimum age at which the state of a CB3 controller counts as stale, ns: three and a half of its 8 ms steps, so that
+/// one missing package is not a fault.
 const MIN_CB3_STATE_AGE_NS: u64 = 28_000_000;
 
-/// The configuration of the command cycle, for an arm with these kinematics, on a host that gave real-time scheduling or did not.
+/// The configuration of the command cycle, for an arm with these kinematics, on a host that gave real-time scheduling
+/// or did not.
 pub fn cycle_config(c: &Config, dh: Dh, realtime: bool) -> CycleConfig {
-    // A host without real-time scheduling misses cycles all the time: they are counted and reported, and only a stall stops the arm.
-    // The robot's own watchdog covers that as well.
+    // A host without real-time scheduling misses cycles all the time: they are counted and reported, and only a stall
+    // stops the arm. The robot's own watchdog covers that as well.
     let strict = realtime && !c.threads.best_effort;
     let mut watch = if strict { WatchSettings::default() } else { WatchSettings::best_effort() };
     if !c.arm.model.is_e_series() {

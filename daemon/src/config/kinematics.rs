@@ -49,7 +49,7 @@ pub fn load_kinematics(path: &Path, model: Model) -> Result<Dh, Failure> {
             if !(v.is_finite() && v.abs() <= limit) {
                 let unit = if limit < 5.0 { "m, not mm" } else { "rad, not degrees" };
                 return Err(Failure::input(format!(
-                    "{shown}: dh.{name}[{i}] = {v} is out of range: at most {limit} either way ({unit})"
+                    "{shown}: dh.{name}[{i}] = {v} is out of range: its magnitude must be at most {limit} ({unit})"
                 )));
             }
         }

@@ -1,4 +1,5 @@
-//! The motion limits of graspd.toml, built as the command cycle builds them, so that `graspd check` refuses what `graspd run` would.
+//! The motion limits of graspd.toml, built as the command cycle builds them, so that `graspd check` refuses what
+//! `graspd run` would.
 
 use super::ranges::bad;
 use super::raw::RawLimits;

@@ -1,7 +1,7 @@
 //! graspd.toml, from text to valid values.
 //!
-//! [`Config::load`] reads the file and every file it names, checks them and converts them once; no other module validates a value or
-//! compares a configuration string.
+//! [`Config::load`] reads the file and every file it names, checks them and converts them once; no other module
+//! validates a value or compares a configuration string.
 //!
 //! | file | holds |
 //! |---|---|

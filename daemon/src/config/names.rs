@@ -23,8 +23,8 @@ pub fn names(cell: &str, root: Option<&Path>) -> Result<Names, Failure> {
     .map_err(|e| Failure::input(e.to_string()))
 }
 
-/// The absolute path without `..` and without links in its existing folders. The last component is not resolved: it may be a link, or
-/// may not exist yet; the code that opens it checks it.
+/// The absolute path without `..` and without links in its existing folders. The last component is not resolved: it may
+/// be a link, or may not exist yet; the code that opens it checks it.
 fn full_path(path: &Path) -> std::io::Result<PathBuf> {
     let path = std::path::absolute(path)?;
     let Some(last) = path.file_name() else { return Ok(path) };

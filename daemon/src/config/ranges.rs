@@ -10,8 +10,8 @@ pub(super) fn bad(path: &Path, key: &str, value: &str, fix: &str) -> Failure {
     Failure::input(format!("{}: {key} = \"{value}\": {fix}", path.display()))
 }
 
-/// Checks every number: finite, and within what the arm, the host or the control law can do. The motion limits have a check of their
-/// own.
+/// Checks every number: finite, and within what the arm, the host or the control law can do. The motion limits have a
+/// check of their own.
 pub(super) fn check_numbers(path: &Path, c: &RawConfig) -> Result<(), Failure> {
     let ranges: &[(&str, f64, f64, f64)] = &[
         ("arm.watchdog_ms", c.arm.watchdog_ms, 20.0, 200.0),

@@ -102,8 +102,8 @@ pub(super) struct RawLoop {
     pub(super) spin_us: f64,
     /// Refuse to start on a host that refuses priority or locked memory.
     pub(super) require_realtime: bool,
-    /// Count missed cycles instead of holding the arm for them, and allow twice the delay before a fault: for a shared or ordinary
-    /// host. Always the case without real-time priority.
+    /// Count missed cycles instead of holding the arm for them, and allow twice the delay before a fault: for a shared
+    /// or ordinary host. Always the case without real-time priority.
     pub(super) best_effort: bool,
 }
 
@@ -133,7 +133,8 @@ pub(super) struct RawVision {
     pub(super) frame_rate_hz: f64,
     /// Maximum time between the exposures of the two views, ms.
     pub(super) max_skew_ms: f64,
-    /// Minimum number of marks with which the motion continues, summed over both views: a mark seen in both counts twice.
+    /// Minimum number of marks with which the motion continues, summed over both views: a mark seen in both counts
+    /// twice.
     pub(super) min_observations: usize,
 }
 
@@ -178,7 +179,8 @@ impl Default for RawServo {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct RawConverged {
-    /// Maximum root mean square image error at which a goal counts as reached, px: detects a plan that was made with another rig.
+    /// Maximum root mean square image error at which a goal counts as reached, px: detects a plan that was made with
+    /// another rig.
     pub(super) error_px: f64,
     /// Distance to the goal by the tracked marks, m.
     pub(super) distance_m: f64,

@@ -6,7 +6,8 @@ use std::path::Path;
 /// Old and new name of each renamed key, with its table.
 const RENAMED: &[(&str, &str)] = &[("loop.beat", "loop.clock")];
 
-/// Refuses a file that uses a key by its old name. Text that is not TOML passes: the typed reader reports it with line and column.
+/// Refuses a file that uses a key by its old name. Text that is not TOML passes: the typed reader reports it with line
+/// and column.
 ///
 /// # Errors
 /// Names the old key and the new one.

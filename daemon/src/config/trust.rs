@@ -1,5 +1,5 @@
-//! Ownership and permissions of the files that the daemon reads: a file that other users can write is refused, because it decides
-//! how the arm moves.
+//! Ownership and permissions of the files that the daemon reads: a file that other users can write is refused, because
+//! it decides how the arm moves.
 
 use crate::exit::Failure;
 use std::os::unix::fs::MetadataExt;
@@ -9,7 +9,8 @@ const OTHERS_WRITE: u32 = 0o002;
 const GROUP_WRITE: u32 = 0o020;
 const STICKY: u32 = 0o1000;
 
-/// Refuses a file that a user other than root and the caller owns or can write, or that others can replace in its folder.
+/// Refuses a file that a user other than root and the caller owns or can write, or that others can replace in its
+/// folder.
 ///
 /// A group-writable file passes where the group is the user's own, as on hosts where each user has a group.
 ///

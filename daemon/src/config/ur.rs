@@ -5,7 +5,8 @@ use crate::arm::UrConfig;
 
 /// The control script refuses joint speeds above the guard's limit times this: room for rounding on the wire.
 const SPEED_MARGIN: f64 = 1.02;
-/// Acceleration of `speedj`, rad/s²: high enough that it follows every set-point within one step. The guard limits the acceleration.
+/// Acceleration of `speedj`, rad/s²: high enough that it follows every set-point within one step. The guard limits the
+/// acceleration.
 const SPEEDJ_ACCELERATION: f64 = 40.0;
 /// Minimum deceleration of the script's own stops, rad/s².
 const MIN_STOP_ACCELERATION: f64 = 4.0;

@@ -36,8 +36,9 @@ pub struct CycleTimer {
 }
 
 impl CycleTimer {
-    /// A timer with this period; the first deadline is one period from now. With `spin_ns` above zero the thread wakes that much earlier
-    /// and spins to the deadline. At most a fifth of the period is used: the kernel throttles FIFO threads that never sleep.
+    /// A timer with this period; the first deadline is one period from now. With `spin_ns` above zero the thread wakes
+    /// that much earlier and spins to the deadline. At most a fifth of the period is used: the kernel throttles FIFO
+    /// threads that never sleep.
     pub fn new(period_ns: u64, spin_ns: u64) -> Self {
         let period_ns = period_ns.max(1);
         Self { period_ns, spin_ns: spin_ns.min(period_ns / 5), next_ns: now_ns() + period_ns }
@@ -63,8 +64,8 @@ pub fn sleep_until(until_ns: u64) {
         tv_sec: i64::try_from(until_ns / 1_000_000_000).unwrap_or(i64::MAX),
         tv_nsec: i64::try_from(until_ns % 1_000_000_000).unwrap_or(0),
     };
-    // After EINTR the sleep continues to the same deadline. No other error is possible for a valid time on this clock; it would only
-    // make this cycle early, and no cycle late.
+    // After EINTR the sleep continues to the same deadline. No other error is possible for a valid time on this clock;
+    // it would only make this cycle early, and no cycle late.
     while let Err(rustix::io::Errno::INTR) = clock_nanosleep_absolute(ClockId::Monotonic, &ts) {}
 }
 

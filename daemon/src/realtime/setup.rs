@@ -27,8 +27,8 @@ impl RealtimeReport {
     }
 }
 
-/// Locks the present and future memory of the process. Future mappings are locked page by page on first access, so that a camera that
-/// reconnects does not stall the mapping thread until its whole segment is resident.
+/// Locks the present and future memory of the process. Future mappings are locked page by page on first access, so that
+/// a camera that reconnects does not stall the mapping thread until its whole segment is resident.
 pub fn lock_memory(report: &mut RealtimeReport) {
     if let Err(e) = mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT) {
         report.refused.push(format!(

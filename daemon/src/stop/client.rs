@@ -104,7 +104,8 @@ fn by_socket(folder: &OwnedFd, name: &str) -> std::io::Result<StopAnswer> {
     }
 }
 
-/// Sends SIGUSR1 to the process that holds the cell's lock: while the lock is held, the process id in it is the daemon's.
+/// Sends SIGUSR1 to the process that holds the cell's lock: while the lock is held, the process id in it is the
+/// daemon's.
 fn by_signal(folder: &OwnedFd, cell: &str) -> Option<i32> {
     let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
     let lock = openat(folder, lock_name(cell).as_str(), flags, Mode::empty()).ok()?;

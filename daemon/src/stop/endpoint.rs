@@ -1,4 +1,5 @@
-//! The stop path's files in the runtime folder: the lock that identifies the daemon's process, and the socket on which it listens.
+//! The stop path's files in the runtime folder: the lock that identifies the daemon's process, and the socket on which
+//! it listens.
 
 use crate::exit::Failure;
 use graspd_shm::Names;
@@ -28,8 +29,8 @@ pub(super) fn open_folder(names: &Names) -> Result<OwnedFd, Errno> {
     rustix::fs::open(names.root(), flags, Mode::empty())
 }
 
-/// Socket address in an open folder: short for every folder path (an address holds 107 bytes), and always in this very folder, also when
-/// its path is replaced.
+/// Socket address in an open folder: short for every folder path (an address holds 107 bytes), and always in this very
+/// folder, also when its path is replaced.
 pub(super) fn address(folder: &OwnedFd, name: &str) -> Result<SocketAddrUnix, Errno> {
     SocketAddrUnix::new(format!("/proc/self/fd/{}/{name}", folder.as_raw_fd()))
 }
@@ -109,7 +110,8 @@ fn take_lock(lock: &OwnedFd) -> Result<(), Errno> {
     flock(lock, FlockOperation::NonBlockingLockExclusive)
 }
 
-/// Listens on a socket in the folder. An existing one of this name is removed: it belongs to a dead daemon, because we hold the lock.
+/// Listens on a socket in the folder. An existing one of this name is removed: it belongs to a dead daemon, because we
+/// hold the lock.
 fn listen_at(folder: &OwnedFd, name: &str) -> Result<UnixListener, Errno> {
     match unlinkat(folder, name, AtFlags::empty()) {
         Ok(()) | Err(Errno::NOENT) => {}

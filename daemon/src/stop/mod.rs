@@ -1,14 +1,15 @@
-//! Stop requests that depend neither on the middleware nor on the log: signals and a Unix socket, both directly to the stop latch.
+//! Stop requests that depend neither on the middleware nor on the log: signals and a Unix socket, both directly to the
+//! stop latch.
 //!
 //! | source | path |
 //! |---|---|
 //! | SIGUSR1 | the signal handler stores into the latch; the command thread takes it at its next cycle |
 //! | SIGTERM, SIGINT, SIGHUP | the same, and the process ends when the arm is at rest |
 //! | `<cell>.stop` | a socket of mode 0600 in the runtime folder, served by the stop thread ([`serve`]) |
-//! | the verb | shared memory and the service thread; used by consoles, and by `graspd stop` when the other paths fail |
+//! | the verb | shared memory and the service thread; for consoles, and for `graspd stop` when the others fail |
 //!
-//! The stop thread does not allocate, log, lock or format. It also ends the process when the regular end fails, for example because a
-//! thread hangs in the middleware or in a connection.
+//! The stop thread does not allocate, log, lock or format. It also ends the process when the regular end fails, for
+//! example because a thread hangs in the middleware or in a connection.
 
 mod client;
 mod endpoint;

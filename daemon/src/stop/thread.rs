@@ -1,7 +1,7 @@
 //! The stop thread: accepts connections, reads one command, sets the stop latch, answers with a fixed line.
 //!
-//! It does not allocate, lock, log or format, and every wait is bounded. The kernel gives the credentials of each client; only the
-//! daemon's user and root are accepted.
+//! It does not allocate, lock, log or format, and every wait is bounded. The kernel gives the credentials of each
+//! client; only the daemon's user and root are accepted.
 
 use super::live::{LiveState, StopSource};
 use crate::realtime::now_ns;
@@ -36,8 +36,8 @@ pub struct ForcedExit {
 }
 
 impl ForcedExit {
-    /// The exit code, if the process has to be ended at `now`. `requested` and `finished` keep the times at which the end was requested
-    /// and the regular end was reached.
+    /// The exit code, if the process has to be ended at `now`. `requested` and `finished` keep the times at which the
+    /// end was requested and the regular end was reached.
     fn due(&self, live: &LiveState, now: u64, requested: &mut Option<u64>, finished: &mut Option<u64>) -> Option<u8> {
         let passed = |since: &mut Option<u64>, limit: u64| now.saturating_sub(*since.get_or_insert(now)) > limit;
         if let Some(code) = live.finished()
@@ -101,7 +101,8 @@ pub fn serve(listener: &UnixListener, live: &Arc<LiveState>, forced: ForcedExit)
     }
 }
 
-/// Waits for a connection or a command, at most 50 ms, or 1 ms while an answer is pending; true when the listener has a connection.
+/// Waits for a connection or a command, at most 50 ms, or 1 ms while an answer is pending; true when the listener has a
+/// connection.
 fn wait(listener: &UnixListener, clients: &[Option<Client>; MAX_CLIENTS]) -> bool {
     let pending = clients.iter().flatten().any(|c| c.stopped_at.is_some());
     let timeout = Timespec { tv_sec: 0, tv_nsec: if pending { 1_000_000 } else { 50_000_000 } };

@@ -1,5 +1,5 @@
-//! The acquisition thread: finds the marks without a prediction when the vision thread has lost them. An ordinary thread, because a
-//! search of complete images may take tens of milliseconds.
+//! The acquisition thread: finds the marks without a prediction when the vision thread has lost them. An ordinary
+//! thread, because a search of complete images may take tens of milliseconds.
 
 use super::frame_refusal::FrameRefusal;
 use super::shared::{RigSeen, Seed, Shared};
@@ -59,10 +59,11 @@ fn failure_text(failure: &AcquireFailure) -> String {
     }
 }
 
-/// Maximum residual of the marks without a remark in the status, px; above it the position error at the grasp is about a millimetre.
+/// Maximum residual of the marks without a remark in the status, px; above it the position error at the grasp is about
+/// a millimetre.
 const MAX_GOOD_RESIDUAL_PX: f64 = 0.5;
-/// Maximum rig error without a remark in the status, standard deviations of its stated error; above it a wrong statement is likelier
-/// than chance.
+/// Maximum rig error without a remark in the status, standard deviations of its stated error; above it a wrong
+/// statement is likelier than chance.
 const MAX_GOOD_RIG_SIGMAS: f64 = 4.0;
 
 /// Remarks on the rig while the marks are tracked; empty where there are none.
@@ -104,7 +105,8 @@ fn rig_text(s: &RigSeen, marks: usize) -> String {
     format!("{} left, {} right of {marks}; {}", s.seen[0], s.seen[1], remarks.join("; "))
 }
 
-/// Both views of a pair as grey images of `size` (width, height), in `buffers`. `convert` writes one view and returns whether it could.
+/// Both views of a pair as grey images of `size` (width, height), in `buffers`. `convert` writes one view and returns
+/// whether it could.
 ///
 /// `None` when a view cannot be converted: its buffer still holds an earlier image then, which must not be searched.
 fn grey_images(

@@ -1,4 +1,5 @@
-//! The command thread: one cycle a period, robot state in, one set-point out. It does not use iceoryx2, locks or the heap.
+//! The command thread: one cycle a period, robot state in, one set-point out. It does not use iceoryx2, locks or the
+//! heap.
 
 use super::cycle_report::CycleReport;
 use super::shared::{JointSample, Shared};
@@ -59,8 +60,8 @@ impl<'a> CommandWorker<'a> {
         }
     }
 
-    /// Runs until shutdown with the robot as the clock: each cycle waits for the robot's package, and its command takes effect in the
-    /// robot's next step. Without packages the cycle runs by a timer.
+    /// Runs until shutdown with the robot as the clock: each cycle waits for the robot's package, and its command takes
+    /// effect in the robot's next step. Without packages the cycle runs by a timer.
     pub fn run_with_robot(&mut self, period_ns: u64) {
         let mut lock = PhaseLock::new(period_ns, now_ns());
         let mut skipped = 0;
@@ -145,7 +146,8 @@ impl<'a> CommandWorker<'a> {
             link: if self.link.is_some() { 2 } else { 1 },
             robot: self.robot.map_or((-1, 0), |r| (r.robot_mode, r.safety_status_bits)),
         };
-        // The ring is full when the telemetry thread does not read: the oldest record is dropped, and the cycle does not wait.
+        // The ring is full when the telemetry thread does not read: the oldest record is dropped, and the cycle does
+        // not wait.
         let _ = self.shared.records.force_push(report);
     }
 

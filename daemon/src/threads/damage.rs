@@ -1,4 +1,5 @@
-//! The watch over the files of the shared memory: an ordinary thread that checks whether they are still present and unchanged.
+//! The watch over the files of the shared memory: an ordinary thread that checks whether they are still present and
+//! unchanged.
 
 use super::shared::Shared;
 use crate::log;
@@ -13,8 +14,8 @@ const PERIOD: Duration = Duration::from_millis(200);
 /// Time until every thread has created its ports; arming takes longer.
 const STARTUP: Duration = Duration::from_millis(600);
 
-/// Runs until shutdown, or until a file is damaged: then the arm is stopped and the process ends with that reason, because its verbs
-/// may no longer reach it. `more` are the daemon's files in addition to the middleware's.
+/// Runs until shutdown, or until a file is damaged: then the arm is stopped and the process ends with that reason,
+/// because its verbs may no longer reach it. `more` are the daemon's files in addition to the middleware's.
 pub fn run(node: &ShmNode, more: &[PathBuf], shared: &Shared) {
     let sleep = |time: Duration| {
         let until = Instant::now() + time;

@@ -23,7 +23,7 @@ const TRACKER: [&str; 7] = [
     "a capture stamp does not advance",
     "left and right were exposed too far apart: check the cameras' trigger (vision.max_skew_ms)",
     "the pair is too old",
-    "a capture stamp lies in the future: stamps are CLOCK_MONOTONIC nanoseconds",
+    "a capture stamp is in the future: stamps are CLOCK_MONOTONIC nanoseconds",
     "the marks are farther from their last position than the gripper can have moved",
 ];
 const FIRST_TOPIC: u32 = 1;

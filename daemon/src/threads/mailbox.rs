@@ -1,4 +1,4 @@
-//! A mailbox for one value between two threads: the newest value replaces an older one, and nobody waits.
+//! A mailbox for one value between two threads: the newest value replaces an older one, and neither side waits.
 
 use crossbeam::queue::ArrayQueue;
 
@@ -15,8 +15,8 @@ impl<T> Default for Mailbox<T> {
 }
 
 impl<T> Mailbox<T> {
-    /// Puts a value. An older value that was not taken is dropped on the calling thread: a real-time thread may put only values whose
-    /// drop is free.
+    /// Puts a value. An older value that was not taken is dropped on the calling thread: a real-time thread may put
+    /// only values whose drop is free.
     pub fn put(&self, value: T) {
         drop(self.queue.force_push(value));
     }

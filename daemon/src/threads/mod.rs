@@ -5,7 +5,7 @@
 //!               └─► acquire (ordinary) ─Mailbox<Seed>─┘ ▲        │        ▲
 //!                                                joints└────────┘        │ requests, set-point, stop latch
 //!                    telemetry (ordinary) ◄──ring of CycleReport──┘       │
-//!                    service (ordinary): verbs, signals, supervision ────┘   link manager (ordinary): connects and reconnects
+//!                    service (ordinary): verbs, signals, supervision ────┘   link manager (ordinary): (re)connects
 //! ```
 
 mod acquire;

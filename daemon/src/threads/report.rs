@@ -148,8 +148,8 @@ impl Report {
     /// Records and logs a message of the controller.
     pub fn controller_message(&self, message: &RobotMessage) {
         let mut s = self.lock();
-        // An error is more specific than the change of safety mode that follows it, and both are more specific than the end of the
-        // program.
+        // An error is more specific than the change of safety mode that follows it, and both are more specific than the
+        // end of the program.
         let normal = ["normal", "reduced"].iter().any(|mode| message.text.starts_with(mode));
         let stops = match (message.kind, s.stop_kind) {
             (MessageKind::Error, _) => true,
@@ -221,8 +221,8 @@ impl Report {
         self.setpoints.pop()
     }
 
-    /// The state as one JSON object, with the keys of `more` added. Mode and motion are those of the last cycle. Nothing is formatted
-    /// under the lock.
+    /// The state as one JSON object, with the keys of `more` added. Mode and motion are those of the last cycle.
+    /// Nothing is formatted under the lock.
     pub fn json(&self, accepted: bool, reason: Option<&str>, marks: &str, live: &LiveState, more: Value) -> String {
         let (_, image_age_ms) = self.images();
         let s = self.lock().clone();

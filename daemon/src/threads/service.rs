@@ -1,5 +1,5 @@
-//! The service thread (the process's main thread): verbs, signals, supervision. It sends requests to the command thread and never
-//! commands the arm.
+//! The service thread (the process's main thread): verbs, signals, supervision. It sends requests to the command thread
+//! and never commands the arm.
 
 use super::acquire::AcquireReport;
 use super::advice::refusal_text;
@@ -21,8 +21,8 @@ use std::time::{Duration, Instant};
 
 /// Maximum age of a request that starts or allows motion, ns: an older one may no longer be what the operator wants.
 const MAX_AGE_NS: u64 = 250_000_000;
-/// Maximum lead of a request's stamp, ns. All processes share one monotonic clock: a later stamp was not taken from it, and the request
-/// would never become too old.
+/// Maximum lead of a request's stamp, ns. All processes share one monotonic clock: a later stamp was not taken from it,
+/// and the request would never become too old.
 const MAX_AHEAD_NS: u64 = 1_000_000;
 /// Maximum image age that a refusal does not mention, ms.
 const MAX_FRESH_IMAGE_MS: f64 = 100.0;
@@ -218,7 +218,8 @@ impl Service<'_> {
         self.ramp_down();
     }
 
-    /// Stops the arm, waits until it is at rest, and ends the control script, so that the robot's watchdog need not end it.
+    /// Stops the arm, waits until it is at rest, and ends the control script, so that the robot's watchdog need not end
+    /// it.
     fn ramp_down(&self) {
         let live = &self.shared.live;
         live.stop(StopSource::Ending);

@@ -1,5 +1,5 @@
-//! The telemetry thread: reads the cycle records, keeps latency histograms, publishes 50 samples a second, logs changes of mode. An
-//! ordinary thread, so that formatting, histograms and publishing do not delay the command cycle.
+//! The telemetry thread: reads the cycle records, keeps latency histograms, publishes 50 samples a second, logs changes
+//! of mode. An ordinary thread, so that formatting, histograms and publishing do not delay the command cycle.
 
 use super::cycle_report::CycleReport;
 use super::frame_refusal::FrameRefusal;

@@ -1,5 +1,5 @@
-//! The vision thread: takes the newest stereo pair, tracks it and passes the gripper pose on. It owns the frame subscriber, and nothing
-//! that it does can delay the command cycle.
+//! The vision thread: takes the newest stereo pair, tracks it and passes the gripper pose on. It owns the frame
+//! subscriber, and nothing that it does can delay the command cycle.
 
 use super::frame_refusal::FrameRefusal;
 use super::shared::{RigSeen, Seed, Shared};
@@ -14,8 +14,8 @@ use graspd_shm::frame::{FramePolicy, FrameSubscriber, SourceEvent};
 use graspd_shm::{ShmError, ShmNode};
 use std::sync::atomic::Ordering;
 
-/// Number of consecutive identical images at which the camera counts as frozen, if the arm moves. Fewer may be equal by chance when the
-/// marks hardly move.
+/// Number of consecutive identical images at which the camera counts as frozen, if the arm moves. Fewer may be equal by
+/// chance when the marks hardly move.
 const MIN_FROZEN_FRAMES: u32 = 5;
 
 /// The vision thread's state; created on the thread that runs it.

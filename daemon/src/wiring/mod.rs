@@ -22,7 +22,8 @@ use threads::Threads;
 /// Runs the daemon until a signal ends it.
 ///
 /// # Errors
-/// A link that cannot be made at the start, a host that refuses real-time scheduling where it is required, or a bug of graspd.
+/// A link that cannot be made at the start, a host that refuses real-time scheduling where it is required, or a bug of
+/// graspd.
 pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
     log::start().map_err(|e| Failure::link(format!("the log thread cannot be started ({e})")))?;
     let shared = Shared::default();
@@ -80,7 +81,8 @@ pub fn run(config: &Config, config_path: &Path) -> Result<Exit, Failure> {
 /// Time for each real-time thread to report what the host refused.
 const HOST_REPORT_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Collects what the host refused to the two real-time threads, and refuses a host that the configuration does not allow.
+/// Collects what the host refused to the two real-time threads, and refuses a host that the configuration does not
+/// allow.
 fn check_host(
     config: &Config,
     report: &Report,

@@ -12,15 +12,17 @@ use serde_json::Value;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Time after the ramp of a stop until the process is ended by force, ns: for the end of the control script and for an answer that is
-/// under way.
+/// Time after the ramp of a stop until the process is ended by force, ns: for the end of the control script and for an
+/// answer that is under way.
 const MAX_SHUTDOWN_NS: u64 = 3_000_000_000;
-/// Time after the regular end until the process is ended although threads are still running, ns: one may wait for a controller.
+/// Time after the regular end until the process is ended although threads are still running, ns: one may wait for a
+/// controller.
 const MAX_JOIN_NS: u64 = 1_000_000_000;
 
 /// Starts the stop thread. It is not joined: it outlives all other threads, because it ends a process that hangs.
 ///
-/// Its priority is just below the command thread's, so that it runs while images are tracked; it uses little processor time.
+/// Its priority is just below the command thread's, so that it runs while images are tracked; it uses little processor
+/// time.
 pub(super) fn start_stop_thread(
     config: &Config,
     endpoint: &mut StopEndpoint,
@@ -45,8 +47,8 @@ pub(super) fn start_stop_thread(
         })
 }
 
-/// The arm's kinematics as configured. With "controller" this waits until the controller answers or the daemon has to end (`None`):
-/// nothing may be commanded with another arm's kinematics.
+/// The arm's kinematics as configured. With "controller" this waits until the controller answers or the daemon has to
+/// end (`None`): nothing may be commanded with another arm's kinematics.
 pub(super) fn arm_kinematics(
     config: &Config,
     report: &Report,

@@ -31,8 +31,8 @@ pub(super) struct Threads<'a> {
 }
 
 impl<'a> Threads<'a> {
-    /// Starts all threads. The two real-time threads report to `host` what the host refused; the command thread then waits for its
-    /// cycle.
+    /// Starts all threads. The two real-time threads report to `host` what the host refused; the command thread then
+    /// waits for its cycle.
     ///
     /// # Errors
     /// When a thread cannot be started.

@@ -1,4 +1,5 @@
-//! A hostile connection: a proxy between client and controller that forwards data and breaks each RTDE connection in one of several ways.
+//! A hostile connection: a proxy between client and controller that forwards data and breaks each RTDE connection in
+//! one of several ways.
 
 use graspd_rt::rtde::Framer;
 use std::collections::BTreeMap;

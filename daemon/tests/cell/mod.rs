@@ -104,7 +104,7 @@ impl World {
         for (view, name) in [(View::Left, "left.png"), (View::Right, "right.png")] {
             renderer.image(view, &shot).save(folder.join(name)).unwrap();
         }
-        let click = |eye: usize| Some(format!("{:.1},{:.1}", scenario.clicks[eye].x, scenario.clicks[eye].y));
+        let click = |view: usize| Some(format!("{:.1},{:.1}", scenario.clicks[view].x, scenario.clicks[view].y));
         let done = run(&Request {
             left: folder.join("left.png"),
             right: folder.join("right.png"),
@@ -194,13 +194,13 @@ impl World {
         (text("state"), text("cause"))
     }
 
-    /// Sends the plan, arms, servoes and returns after `after`. If a stall of the host ends the control script before the arm has moved,
-    /// the robot is recovered, the fault is reset, and the sequence is repeated.
+    /// Sends the plan, arms, servoes and returns after `after`. If a stall of the host ends the control script before
+    /// the arm has moved, the robot is recovered, the fault is reset, and the sequence is repeated.
     pub(crate) fn servo(&self, after: Duration) {
         let plan = self.path("plan.toml");
         let until = Instant::now() + Duration::from_secs(120);
         'again: loop {
-            let begun = Instant::now();
+            let started = Instant::now();
             for verb in [&["setpoint", &plan][..], &["arm"], &["servo"]] {
                 loop {
                     let (accepted, answer) = self.verb(verb);
@@ -211,7 +211,7 @@ impl World {
                     assert!(Instant::now() < until, "{verb:?} is refused: {answer}\n{}", log());
                     std::thread::sleep(Duration::from_millis(100));
                     let fault = answer.get("state").and_then(Value::as_str) == Some("fault");
-                    if fault || begun.elapsed() > Duration::from_secs(15) {
+                    if fault || started.elapsed() > Duration::from_secs(15) {
                         self.verb(&["recover"]);
                         self.verb(&["reset"]);
                         continue 'again;

@@ -57,15 +57,16 @@ fn norm(v: &[f64; 6]) -> f64 {
     v.iter().map(|x| x * x).sum::<f64>().sqrt()
 }
 
-/// Whether the rates are parallel to the previous ones and smaller, as on a stop ramp. The control law changes their direction.
+/// Whether the rates are parallel to the previous ones and smaller, as on a stop ramp. The control law changes their
+/// direction.
 fn shrinks(from: &[f64; 6], to: &[f64; 6]) -> bool {
     let (a, b) = (norm(from), norm(to));
     let off = (0..6).map(|i| (to[i] - from[i] * b / a).abs()).fold(0.0, f64::max);
     b < a && off <= 1e-9 * a
 }
 
-/// Measures the last stop in `entries`. An error that begins with a capital letter is a failure; any other says that the arm was not in
-/// motion.
+/// Measures the last stop in `entries`. An error that begins with a capital letter is a failure; any other says that
+/// the arm was not in motion.
 pub(crate) fn judge(entries: &[Entry], asked_ns: u64) -> Result<Stop, String> {
     let sent: Vec<(u64, [f64; 6])> = entries
         .iter()
@@ -219,7 +220,8 @@ pub(crate) fn ended(process: &mut Process, limit: Duration) -> Option<i32> {
     }
 }
 
-/// Ends a daemon by a signal during motion: it ramps down, ends the script without the controller's watchdog, and exits with code 0.
+/// Ends a daemon by a signal during motion: it ramps down, ends the script without the controller's watchdog, and exits
+/// with code 0.
 pub(crate) fn end_by(cell: &mut Cell, daemon: &mut Process, signal: Signal, what: &str) {
     let (stop, entries) = cell.stop(&mut |_| daemon.signal(signal));
     stop.check(what);
@@ -239,13 +241,13 @@ pub(crate) fn by_verb_of(client: &RequestClient) {
 pub(crate) struct Load {
     end: Arc<AtomicBool>,
     answered: Arc<AtomicU64>,
-    begun: Instant,
+    started: Instant,
 }
 
 impl Load {
     /// Starts four clients that together send `per_second` requests a second.
     pub(crate) fn start<'scope>(scope: &'scope std::thread::Scope<'scope, '_>, names: &Names, per_second: u32) -> Self {
-        let load = Self { end: Arc::default(), answered: Arc::default(), begun: Instant::now() };
+        let load = Self { end: Arc::default(), answered: Arc::default(), started: Instant::now() };
         for _ in 0..4 {
             let (end, answered, names) = (Arc::clone(&load.end), Arc::clone(&load.answered), names.clone());
             scope.spawn(move || {
@@ -270,7 +272,7 @@ impl Load {
     /// Ends the clients; returns the number of answers a second.
     pub(crate) fn end(self) -> f64 {
         self.end.store(true, Ordering::Relaxed);
-        self.answered.load(Ordering::Relaxed) as f64 / self.begun.elapsed().as_secs_f64()
+        self.answered.load(Ordering::Relaxed) as f64 / self.started.elapsed().as_secs_f64()
     }
 }
 

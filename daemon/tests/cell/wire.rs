@@ -1,5 +1,5 @@
-//! Reader of the mock's wire record while it grows: the commands and the arm's motion in the order in which the mock processed them.
-//! Controller times are the mock's clock, which stalls together with the mock.
+//! Reader of the mock's wire record while it grows: the commands and the arm's motion in the order in which the mock
+//! processed them. Controller times are the mock's clock, which stalls together with the mock.
 
 use graspd_rt::rtde::Field;
 use std::io::{Read, Seek, SeekFrom};
@@ -8,9 +8,11 @@ use std::path::PathBuf;
 /// One entry of the record.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Entry {
-    /// A command with this heartbeat, mode word and rates (rad/s), and when the mock received it (ns of CLOCK_MONOTONIC).
+    /// A command with this heartbeat, mode word and rates (rad/s), and when the mock received it (ns of
+    /// CLOCK_MONOTONIC).
     Heartbeat { heartbeat: i32, mode: i32, at_ns: u64, rates: [f64; 6] },
-    /// A control step: controller time, target speed and true speed of the fastest joint (rad/s), and when the mock made it (ns).
+    /// A control step: controller time, target speed and true speed of the fastest joint (rad/s), and when the mock
+    /// made it (ns).
     Step { clock_s: f64, target: f64, speed: f64, at_ns: u64 },
     /// An event, as text.
     Note(String),

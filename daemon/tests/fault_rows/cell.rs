@@ -1,5 +1,5 @@
-//! The daemon's link and command cycle against the mock controller's server in lock step: loopback TCP, RTDE, the control script, and a
-//! clock that the test controls, so that a stall of the host does not matter.
+//! The daemon's link and command cycle against the mock controller's server in lock step: loopback TCP, RTDE, the
+//! control script, and a clock that the test controls, so that a stall of the host does not matter.
 
 use std::collections::VecDeque;
 use std::net::{IpAddr, Ipv4Addr};
@@ -87,7 +87,8 @@ pub(crate) fn mock(before: &[Command]) -> (Server, UrConfig) {
     panic!("no free loopback address");
 }
 
-/// A second of the robot's own time for every real one is enough for a link to come up; what it must answer is in `ArmError`.
+/// A second of the robot's own time for every real one is enough for a link to come up; what it must answer is in
+/// `ArmError`.
 pub(crate) fn bring_up(config: &UrConfig) -> Result<UrLink, ArmError> {
     let mut link = UrLink::connect(config)?;
     link.bring_up(config)?;

@@ -1,8 +1,8 @@
-//! Faults of the link and of the robot, injected into the mock controller: the code that the daemon's link and command cycle must report,
-//! the time within which, and that the arm comes to rest and stays at rest.
+//! Faults of the link and of the robot, injected into the mock controller: the code that the daemon's link and command
+//! cycle must report, the time within which, and that the arm comes to rest and stays at rest.
 //!
-//! The rows are numbered R (link) and B (robot). The test controls the clock, so that the printed figures (`--nocapture`) are exact and
-//! reproducible.
+//! The rows are numbered R (link) and B (robot). The test controls the clock, so that the printed figures
+//! (`--nocapture`) are exact and reproducible.
 #![cfg(feature = "demo")]
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 
@@ -16,7 +16,8 @@ use graspd_rt::mode::{ModeName, Reject};
 
 /// The RTDE port.
 const RTDE: Port = Port::Rtde;
-/// Time from full speed to rest at the daemon's 4 rad/s², and the delays of the guard's filter, the link and the drives, ms.
+/// Time from full speed to rest at the daemon's 4 rad/s², and the delays of the guard's filter, the link and the
+/// drives, ms.
 const RAMP_MS: u64 = 125 + 20 + 60;
 
 /// Codes for set-points that do not arrive.
@@ -378,8 +379,8 @@ fn a_link_that_ends_reports_its_fault() {
     }
 }
 
-/// With wrong kinematics the gripper's speed differs from the computed one. The tool speed that the controller reports shows it, for any
-/// tool point. A controller that does not report it is supported.
+/// With wrong kinematics the gripper's speed differs from the computed one. The tool speed that the controller reports
+/// shows it, for any tool point. A controller that does not report it is supported.
 #[test]
 fn wrong_kinematics_are_detected_by_the_controllers_tool_speed() {
     let tool = Command::Tcp { pose: [0.02, -0.03, 0.17, 0.1, 0.2, -0.3] };

@@ -1,16 +1,17 @@
-//! The arm's own motion by its encoders, as the vision thread uses it: where the gripper was when a pair was exposed, how far it
-//! moved between two instants, and whether it moved at all.
+//! The arm's own motion by its encoders, as the vision thread uses it: where the gripper was when a pair was exposed,
+//! how far it moved between two instants, and whether it moved at all.
 
 use super::predict::{JointHistory, left_from_gripper_now};
 use crate::arm::{Dh, Joints};
 use crate::geom::Pose;
 
-/// Maximum age of the newest joint sample, relative to the exposure of a pair, with which the pair still gets a pose from the
-/// encoders, ns: ten packages at 500 Hz. Older joints do not say where the arm was during the exposure.
+/// Maximum age of the newest joint sample, relative to the exposure of a pair, with which the pair still gets a pose
+/// from the encoders, ns: ten packages at 500 Hz. Older joints do not say where the arm was during the exposure.
 const MAX_JOINT_AGE_NS: u64 = 20_000_000;
 /// Time over which [`ArmMotion::moved_before`] compares the joints, ns.
 const MOTION_WINDOW_NS: u64 = 100_000_000;
-/// Minimum motion of a joint within [`MOTION_WINDOW_NS`] that has to change the image, rad: 10 mrad/s, 0.5 mm of the gripper at 0.5 m.
+/// Minimum motion of a joint within [`MOTION_WINDOW_NS`] that has to change the image, rad: 10 mrad/s, 0.5 mm of the
+/// gripper at 0.5 m.
 const MIN_VISIBLE_MOTION_RAD: f64 = 1e-3;
 
 /// Mid-exposure time of a stereo pair, ns: the mean of the two views' stamps, rounded down.
@@ -38,8 +39,8 @@ impl ArmMotion {
         self.history.push(at_ns, q);
     }
 
-    /// Gripper in the robot's base at `at_ns`; `None` without joints of that time, or when the newest sample is more than
-    /// 20 ms older.
+    /// Gripper in the robot's base at `at_ns`; `None` without joints of that time, or when the newest sample is more
+    /// than 20 ms older.
     pub fn base_from_gripper(&self, at_ns: u64) -> Option<Pose> {
         if at_ns > self.history.newest_ns().saturating_add(MAX_JOINT_AGE_NS) {
             return None;
@@ -48,14 +49,15 @@ impl ArmMotion {
         Some(self.dh.base_from_gripper(&q, &self.flange_from_gripper))
     }
 
-    /// The pose at `to_ns` of a gripper that was at `left_from_gripper` at `from_ns`; `None` where the history does not reach back to
-    /// either instant.
+    /// The pose at `to_ns` of a gripper that was at `left_from_gripper` at `from_ns`; `None` where the history does not
+    /// reach back to either instant.
     pub fn carried(&self, left_from_gripper: &Pose, from_ns: u64, to_ns: u64) -> Option<Pose> {
         let (then, now) = (self.history.at(from_ns)?, self.history.at(to_ns)?);
         Some(left_from_gripper_now(&self.dh, &self.flange_from_gripper, left_from_gripper, &then, &now))
     }
 
-    /// Whether a joint moved by more than 1 mrad in the 100 ms before `at_ns`; false where the history does not reach back that far.
+    /// Whether a joint moved by more than 1 mrad in the 100 ms before `at_ns`; false where the history does not reach
+    /// back that far.
     pub fn moved_before(&self, at_ns: u64) -> bool {
         let then_ns = at_ns.saturating_sub(MOTION_WINDOW_NS);
         let (Some(now), Some(then)) = (self.history.at(at_ns), self.history.at(then_ns)) else { return false };

@@ -54,8 +54,8 @@ pub(super) fn options(args: &DemoArgs) -> Result<Options, Failure> {
     Ok(o)
 }
 
-/// A loopback address on which the controller's ports are free. With one address for each demo no other demo uses its ports, nor does an
-/// outgoing connection, as could happen with a port offset into the range of ephemeral ports.
+/// A loopback address on which the controller's ports are free. With one address for each demo no other demo uses its
+/// ports, nor does an outgoing connection, as could happen with a port offset into the range of ephemeral ports.
 fn free_address(seed: u64) -> Result<String, Failure> {
     let start = u64::from(std::process::id()).wrapping_mul(131).wrapping_add(seed.wrapping_mul(17));
     for k in 0..200_u64 {
@@ -132,7 +132,8 @@ impl Cell {
         Ok(Self { daemon, scene, mock, config, world, scenario, published: None })
     }
 
-    /// Pairs a second that the scene published since the last call; `None` in the first call, or when the scene does not answer.
+    /// Pairs a second that the scene published since the last call; `None` in the first call, or when the scene does
+    /// not answer.
     pub(super) fn pairs_per_second(&mut self) -> Option<f64> {
         let status = self.scene.ask(r#"{"ask":"status"}"#, Duration::from_secs(3)).ok()?;
         let now = (status.get("published")?.as_u64()?, Instant::now());

@@ -1,8 +1,8 @@
 //! `graspd demo`: the complete chain against a simulated world, in separate processes.
 //!
-//! The demo does what an operator does: it takes the first images from shared memory, clicks where the world's script has the object,
-//! runs `graspd plan`, sends the plan, arms, servoes and watches. The daemon gets no poses of the world, and the final error is the
-//! ground truth of the scene.
+//! The demo does what an operator does: it takes the first images from shared memory, clicks where the world's script
+//! has the object, runs `graspd plan`, sends the plan, arms, servoes and watches. The daemon gets no poses of the
+//! world, and the final error is the ground truth of the scene.
 
 mod cell;
 mod process;

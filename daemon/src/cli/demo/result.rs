@@ -1,4 +1,5 @@
-//! The result of the demo: the error by the scene's ground truth, limit violations by the mock controller, timing by the daemon.
+//! The result of the demo: the error by the scene's ground truth, limit violations by the mock controller, timing by
+//! the daemon.
 
 use super::cell::Cell;
 use super::watch::{CONVERGED, Outcome};
