@@ -1,9 +1,9 @@
-//! What a 500 Hz cycle costs in processor time: `cargo bench -p graspd --bench rtde_cycle [-- SECONDS]`.
+//! Processor time of a 500 Hz cycle of the UR link: `cargo bench -p graspd --bench rtde_cycle [-- SECONDS]`.
 //!
-//! Two loops in the same run, alternating, with the same system calls in the same order (poll, read until it would block,
-//! QUICKACK, write): one moves bytes only, the other is the whole link, framing, session, decoding, gap count and encoding.
-//! The peer is a thread that sends a state every 2 ms; processor time is that of the measured thread alone.
-#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
+//! Two alternating loops with the same system calls in the same order (poll, read until it would block, QUICKACK,
+//! write): one only moves bytes, the other is the complete link with framing, session, decoding, gap count and
+//! encoding. The peer is a thread that sends a state every 2 ms; only the processor time of the measured thread counts.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -23,7 +23,7 @@ fn cpu_ns() -> u64 {
     t.tv_sec as u64 * 1_000_000_000 + t.tv_nsec as u64
 }
 
-/// The peer: with a handshake when asked, then a state each cycle until the client goes.
+/// The peer: an optional handshake, then a state in each cycle until the client closes.
 fn peer(listener: TcpListener, handshake: bool, stop: Arc<AtomicBool>) {
     let (mut stream, _) = listener.accept().expect("a client");
     stream.set_nodelay(true).expect("nodelay");
@@ -88,7 +88,7 @@ fn start(handshake: bool) -> (u16, Arc<AtomicBool>, std::thread::JoinHandle<()>)
     (port, stop, std::thread::spawn(move || peer(listener, handshake, stopped)))
 }
 
-/// Processor time of one cycle, ns, of the link.
+/// Processor time of one cycle of the link, ns.
 fn link(cycles: u64) -> f64 {
     let (port, stop, thread) = start(true);
     let mut config = UrConfig::new("127.0.0.1", Model::Ur5e);
@@ -119,7 +119,7 @@ fn link(cycles: u64) -> f64 {
     cost
 }
 
-/// The same system calls around bytes that nobody looks at.
+/// Processor time of the same system calls without any decoding, ns.
 fn bare(cycles: u64) -> f64 {
     let (port, stop, thread) = start(false);
     let mut stream = TcpStream::connect(("127.0.0.1", port)).expect("a connection");

@@ -1,17 +1,18 @@
-//! The real client half against the mock controller for as long as you like: `cargo bench -p graspd --bench soak -- 600 [robot] [ur5]`.
+//! Soak test of the command thread against the mock controller:
+//! `cargo bench -p graspd --bench soak -- SECONDS [robot] [ur5]`.
 //!
-//! The daemon's command thread (its cycle, its UR link, its cycle) drives a wrist gently to and fro over RTDE against
-//! `graspd-mock-ur` in a process of its own. Printed: gaps by the controller's clock, each blamed on whom it belongs to (steps that the
-//! host stole from the mock, packages that the mock left out because we did not read, packages that we lost); the round trip from a
-//! command to its echo as bars; memory and descriptors of both processes over time. Ends with code 1 when a gap is ours or something grows.
-#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
+//! The daemon's command thread (command cycle and UR link) swings a wrist over RTDE against `graspd-mock-ur` in a
+//! separate process. Printed: gaps by the controller's clock with their causes (steps that the mock missed because the
+//! host stalled, packages that the mock left out because the client did not read, packages that the client lost); a
+//! histogram of the round trip from a command to its echo; memory and descriptors of both processes over time. Exits
+//! with code 1 when the client lost a package or memory grows.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 
 #[path = "../tests/cell/wire.rs"]
 mod wire;
 
 use graspd::arm::{ArmLink, LinkFault, LinkPoll, LinkStats, UrLink};
-use graspd::config::{Config, cycle_config};
-use graspd::links::ur_config;
+use graspd::config::{Clock, Config, cycle_config, ur_config};
 use graspd::realtime::{RealtimeReport, ThreadSettings, enter, now_ns};
 use graspd::threads::{CommandWorker, Shared};
 use graspd_hil::scenario::{Options, Scenario};
@@ -26,7 +27,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 use wire::{Entry, Wire};
 
-/// Swings wrist 3 whatever the cycle says: without cameras it would say idle.
+/// Swings wrist 3 in place of the cycle's commands: without cameras the cycle commands idle.
 struct Swing {
     link: UrLink,
     phase: f64,
@@ -96,7 +97,7 @@ fn bars(title: &str, values: &mut [u64], width_us: u64) {
     }
     let most = bins.values().copied().max().unwrap_or(1) as f64;
     for (bin, n) in bins {
-        // Square root, so that rare ones are seen.
+        // Square root, so that rare values are visible.
         let bar = "#".repeat(((n as f64 / most).sqrt() * 60.0).ceil() as usize);
         let more = if bin == 40 { "+" } else { " " };
         println!("  {:6}{more} {n:8} {bar}", bin * width_us);
@@ -128,11 +129,11 @@ fn main() {
         .stdout(Stdio::piped())
         .spawn()
         .unwrap();
-    let mut said = BufReader::new(mock.stdout.take().unwrap()).lines();
-    said.next().unwrap().unwrap();
+    let mut output = BufReader::new(mock.stdout.take().unwrap()).lines();
+    output.next().unwrap().unwrap();
     let code = soak(&config, seconds, mock.id(), &record);
     drop(mock.stdin.take());
-    println!("mock: {}", said.next().unwrap().unwrap());
+    println!("mock: {}", output.next().unwrap().unwrap());
     mock.wait().unwrap();
     let _ = std::fs::remove_dir_all(&folder);
     std::process::exit(code);
@@ -140,45 +141,45 @@ fn main() {
 
 fn soak(config: &Config, seconds: f64, mock: u32, record: &Path) -> i32 {
     let mut ur = ur_config(config);
-    // A host that stalls for 50 ms must not end the script, and with it the measurement.
+    // A stall of the host of 50 ms must not end the script and the measurement.
     ur.watchdog_ms = 1000.0;
     let mut link = UrLink::connect(&ur).unwrap();
     link.bring_up(&ur).unwrap();
-    let period_s = config.period_ns() as f64 * 1e-9;
+    let period_s = config.threads.period_ns() as f64 * 1e-9;
     let swing: Box<dyn ArmLink> = Box::new(Swing { link, phase: 0.0, period_s });
-    let begun = now_ns();
+    let started = now_ns();
     let (shared, cycle) =
-        (Shared::default(), CommandCycle::new(cycle_config(config, Dh::nominal(config.model), false)).unwrap());
+        (Shared::default(), CommandCycle::new(cycle_config(config, Dh::nominal(config.arm.model), false)).unwrap());
     shared.link_ready.put(swing);
     let expected = (seconds / period_s) as usize;
     let (mut trips, mut wakes, mut skipped) = (Vec::with_capacity(expected), Vec::with_capacity(expected), 0);
     let mut memory = Vec::new();
-    // Room is touched once, so that filling it is not taken for growth.
+    // The memory is touched once, so that filling it does not count as growth.
     trips.resize(expected, 1u64);
     wakes.resize(expected, 1u64);
     trips.clear();
     wakes.clear();
     let stats = std::thread::scope(|scope| {
         scope.spawn(|| {
-            let mut heard = RealtimeReport::default();
-            enter("command", &ThreadSettings { priority: 80, core: None }, &mut heard);
-            heard.refused.iter().for_each(|r| println!("not real-time: {r}"));
+            let mut host = RealtimeReport::default();
+            enter("command", &ThreadSettings { priority: 80, core: None }, &mut host);
+            host.refused.iter().for_each(|r| println!("not real-time: {r}"));
             let mut worker = CommandWorker::new(cycle, &shared);
-            if config.raw.cycle.clock == "robot" {
-                worker.run_with_robot(config.period_ns());
+            if config.threads.clock == Clock::Robot {
+                worker.run_with_robot(config.threads.period_ns());
             } else {
-                worker.run(config.period_ns(), 0);
+                worker.run(config.threads.period_ns(), 0);
             }
         });
         let start = Instant::now();
         let mut next = 0.0;
         while start.elapsed().as_secs_f64() < seconds {
-            while let Some(note) = shared.records.pop() {
+            while let Some(cycle) = shared.records.pop() {
                 if trips.len() < expected && wakes.len() < expected {
-                    trips.extend(note.round_trip_ns);
-                    wakes.push(note.wakeup_ns);
+                    trips.extend(cycle.round_trip_ns);
+                    wakes.push(cycle.wakeup_ns);
                 }
-                skipped += note.skipped;
+                skipped += cycle.skipped;
             }
             if start.elapsed().as_secs_f64() >= next {
                 memory.push((next, held(std::process::id()), held(mock)));
@@ -187,29 +188,29 @@ fn soak(config: &Config, seconds: f64, mock: u32, record: &Path) -> i32 {
             std::thread::sleep(Duration::from_millis(20));
         }
         memory.push((seconds, held(std::process::id()), held(mock)));
-        let lost = shared.link_dead.take();
+        let failed = shared.link_dead.take();
         shared.drop_link.store(true, Ordering::Release);
         std::thread::sleep(Duration::from_millis(100));
-        let link = lost.or_else(|| shared.link_dead.take());
+        let link = failed.or_else(|| shared.link_dead.take());
         shared.shutdown.store(true, Ordering::Release);
         link.map(|l| (l.stats(), l.fault()))
     });
     let ended = now_ns();
     std::thread::sleep(Duration::from_millis(500));
     let Some((stats, fault)) = stats else {
-        println!("the command thread did not give its link back");
+        println!("the command thread did not return its link");
         return 1;
     };
-    // Steps that share an instant were made up after a stall of the host: only the last of them was sent.
+    // Steps with the same time were made up after a stall of the host: only the last of them was sent.
     let entries = Wire::open(record.to_owned()).read();
     let steps: Vec<u64> = entries
         .iter()
         .filter_map(|e| match e {
-            Entry::Step { at_ns, .. } if (begun..ended).contains(at_ns) => Some(*at_ns),
+            Entry::Step { at_ns, .. } if (started..ended).contains(at_ns) => Some(*at_ns),
             _ => None,
         })
         .collect();
-    let stolen = steps.windows(2).filter(|w| w[0] == w[1]).count() as u64;
+    let stalled = steps.windows(2).filter(|w| w[0] == w[1]).count() as u64;
     let left_out: u64 = entries
         .iter()
         .filter_map(|e| match e {
@@ -219,29 +220,29 @@ fn soak(config: &Config, seconds: f64, mock: u32, record: &Path) -> i32 {
             _ => None,
         })
         .sum();
-    let ours = stats.missing.saturating_sub(stolen + left_out);
-    println!("{seconds:.0} s at {:.0} Hz, cycle by {}", 1.0 / period_s, config.raw.cycle.clock);
+    let lost = stats.missing.saturating_sub(stalled + left_out);
+    println!("{seconds:.0} s at {:.0} Hz, clock {:?}", 1.0 / period_s, config.threads.clock);
     println!(
         "states received {}, commands sent {}, dropped {}, link fault {fault:?}",
         stats.received, stats.sent, stats.dropped
     );
     println!(
-        "gaps by the controller's clock: {} packages; {stolen} are steps that the host stole from the mock, {left_out} the mock left out, {ours} are ours",
+        "gaps by the controller's clock: {} packages; {stalled} steps missed by the mock in stalls of the host, {left_out} left out by the mock, {lost} lost by the client",
         stats.missing
     );
-    println!("cycles of ours that the host stole: {skipped}");
+    println!("cycles that the client missed: {skipped}");
     bars("round trip, command to echo", &mut trips, 250);
-    bars("wake-up, late against the grid", &mut wakes, 50);
+    bars("wake-up delay", &mut wakes, 50);
     println!("\n   time s   client kB  fds     mock kB  fds");
     for (at, client, mock) in &memory {
         println!("  {at:7.0} {:11} {:4} {:11} {:4}", client.0, client.1, mock.0, mock.1);
     }
-    // The first tenth warms up: lazily loaded code, allocator pools.
+    // The first tenth is a warm-up: lazily loaded code, allocator pools.
     let early = memory[(memory.len() / 10).max(1).min(memory.len() - 1)];
     let last = memory[memory.len() - 1];
     let grown = (last.1.0.saturating_sub(early.1.0), last.2.0.saturating_sub(early.2.0));
-    println!("grown since then: client {} kB, mock {} kB", grown.0, grown.1);
-    let sound = ours == 0 && fault.is_none() && grown.0 < 1024 && grown.1 < 4096 && last.1.1 <= early.1.1;
-    println!("{}", if sound { "sound" } else { "NOT SOUND" });
-    i32::from(!sound)
+    println!("growth after the first tenth: client {} kB, mock {} kB", grown.0, grown.1);
+    let passed = lost == 0 && fault.is_none() && grown.0 < 1024 && grown.1 < 4096 && last.1.1 <= early.1.1;
+    println!("{}", if passed { "passed" } else { "FAILED" });
+    i32::from(!passed)
 }

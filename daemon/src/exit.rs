@@ -5,13 +5,13 @@
 pub enum Exit {
     /// 0: done.
     Done,
-    /// 1: it ran, and the answer is no: not converged, or the reconstruction was refused.
+    /// 1: completed with a negative result: not converged, or a plan or request was refused.
     NotConverged,
     /// 2: the command line is wrong.
     Usage,
     /// 3: a file, an image, a selection or the configuration is wrong.
     Input,
-    /// 4: a link could not be made or was lost: robot, shared memory, another process.
+    /// 4: a connection failed or was lost: robot, shared memory, another process.
     Link,
     /// 5: a fault is latched.
     Fault,
@@ -31,22 +31,22 @@ impl Exit {
     }
 }
 
-/// A failure of a subcommand: the exit code and one clear sentence that says what to do.
+/// A failure of a subcommand: the exit code and a message.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Failure {
     /// The exit code.
     pub exit: Exit,
-    /// What went wrong, which file, key or value, and what to do.
+    /// What is wrong, with file, key or value, and what to do.
     pub message: String,
 }
 
 impl Failure {
-    /// A failure of the input or configuration.
+    /// A wrong input or configuration.
     pub fn input(message: impl Into<String>) -> Self {
         Self { exit: Exit::Input, message: message.into() }
     }
 
-    /// A failure of a link to another process or to the robot.
+    /// A failed connection to another process or to the robot.
     pub fn link(message: impl Into<String>) -> Self {
         Self { exit: Exit::Link, message: message.into() }
     }
@@ -56,7 +56,7 @@ impl Failure {
         Self { exit: Exit::Fault, message: message.into() }
     }
 
-    /// The work ran, and the answer is no.
+    /// A negative result.
     pub fn refused(message: impl Into<String>) -> Self {
         Self { exit: Exit::NotConverged, message: message.into() }
     }

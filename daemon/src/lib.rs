@@ -1,7 +1,18 @@
-//! The daemon: configuration, threads, sockets and commands. It moves values between boxes and knows no mathematics.
+//! The graspd program: configuration, threads, sockets and commands. The mathematics is in `graspd_rt` and
+//! `graspd_calib`.
 //!
-//! `graspd run` is the real-time daemon (two real-time threads, [`realtime`] and [`threads`]); every other subcommand is an ordinary
-//! program that shares its files and formats.
+//! `graspd run` is the real-time daemon (two real-time threads, [`realtime`] and [`threads`]); the other subcommands
+//! are ordinary programs that use the same files and formats.
+//!
+//! | module | contents |
+//! |---|---|
+//! | [`config`] | graspd.toml, from text to valid values |
+//! | [`arm`] | links to a UR controller and to a simulated arm |
+//! | [`stop`] | stop requests by signal and socket |
+//! | [`threads`] | the daemon's threads, and what they share |
+//! | [`links`] | the link manager |
+//! | [`wiring`] | `graspd run`: starts all of it |
+//! | [`cli`] | the subcommands |
 
 pub mod arm;
 pub mod cli;

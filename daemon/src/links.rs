@@ -1,82 +1,65 @@
-//! The link manager: makes the robot link on an ordinary thread, hands it to the command thread, takes dead ones back. It never arms.
+//! The link manager: makes the robot link on an ordinary thread, hands it to the command thread, and takes failed links
+//! back. It never arms.
 
 use crate::arm::{
-    ArmError, ArmLink, Ear, MockArm, MockLimits, Motion, RecoverTimes, UrConfig, UrLink, backoff_delay,
+    ArmError, ArmLink, MessageListener, MockLimits, MockLink, RecoverTimes, UrConfig, UrLink, backoff_delay,
     check_kinematics, check_model, read_identity, walk_out,
 };
-use crate::config::{Config, Kinematics, LinkKind};
+use crate::config::{Config, Kinematics, LinkKind, ur_config};
 use crate::threads::{Report, Shared};
 use std::cell::RefCell;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// How a UR controller of this configuration is talked to.
-pub fn ur_config(config: &Config) -> UrConfig {
-    let raw = &config.raw;
-    let ranges = config.model.joints();
-    UrConfig {
-        port_offset: raw.arm.port_offset,
-        cycle_hz: raw.cycle.rate_hz,
-        motion: if raw.arm.motion == "position" { Motion::Position } else { Motion::Velocity },
-        // The script refuses what exceeds these, so they carry the guard's own limits with room for rounding, never above the arm's.
-        speed_limits: ranges.map(|r| (raw.limits.joint_speed_rad_s * 1.02).min(r.speed)),
-        // speedj must be able to follow every set-point within a step; the acceleration limit itself is the guard's.
-        acceleration: 40.0,
-        stop_acceleration: raw.limits.joint_accel_rad_s2.max(4.0),
-        watchdog_ms: raw.arm.watchdog_ms,
-        ..UrConfig::new(raw.arm.address.clone(), config.model)
-    }
-}
-
-/// How long things may take.
+/// Timeouts and pauses of the link manager.
 #[derive(Clone, Copy, Debug)]
-pub struct Pace {
-    /// Connecting, and each answer.
+pub struct LinkTimes {
+    /// Timeout of connecting and of each answer.
     pub timeout: Duration,
-    /// Pause before attempt n, from 0.
+    /// Pause before attempt n, counted from 0.
     pub backoff: fn(u32) -> Duration,
-    /// Powering up and unlocking.
+    /// Timeouts of a recovery.
     pub recover: RecoverTimes,
 }
 
-impl Default for Pace {
+impl Default for LinkTimes {
     fn default() -> Self {
         Self { timeout: Duration::from_secs(5), backoff: backoff_delay, recover: RecoverTimes::default() }
     }
 }
 
-/// Makes links and takes them back.
+/// Makes links and takes failed ones back.
 #[derive(Debug)]
 pub struct LinkManager<'a> {
     config: &'a Config,
     shared: &'a Shared,
     report: &'a Report,
     recover: &'a AtomicBool,
-    pace: Pace,
-    /// Hears why the controller stopped; `None` for the arm inside the daemon.
-    ear: RefCell<Option<Ear>>,
+    times: LinkTimes,
+    /// Receives why the controller stopped; `None` for the arm inside the daemon.
+    messages: RefCell<Option<MessageListener>>,
 }
 
 impl<'a> LinkManager<'a> {
-    /// A manager that has made nothing yet.
+    /// A manager that has not made a link yet.
     pub fn new(config: &'a Config, shared: &'a Shared, report: &'a Report, recover: &'a AtomicBool) -> Self {
-        Self::with_pace(config, shared, report, recover, Pace::default())
+        Self::with_times(config, shared, report, recover, LinkTimes::default())
     }
 
-    /// The same at another pace.
-    pub fn with_pace(
+    /// The same with other timeouts.
+    pub fn with_times(
         config: &'a Config,
         shared: &'a Shared,
         report: &'a Report,
         recover: &'a AtomicBool,
-        pace: Pace,
+        times: LinkTimes,
     ) -> Self {
-        let ear = (config.link == LinkKind::Rtde).then(|| Ear::new(&ur_config(config)));
-        Self { config, shared, report, recover, pace, ear: RefCell::new(ear) }
+        let messages = (config.arm.link == LinkKind::Rtde).then(|| MessageListener::new(&ur_config(config)));
+        Self { config, shared, report, recover, times, messages: RefCell::new(messages) }
     }
 
     fn ur_config(&self) -> UrConfig {
-        UrConfig { timeout: self.pace.timeout, ..ur_config(self.config) }
+        UrConfig { timeout: self.times.timeout, ..ur_config(self.config) }
     }
 
     /// Runs until shutdown.
@@ -91,7 +74,7 @@ impl<'a> LinkManager<'a> {
                     self.watch();
                 }
                 Err(e) => {
-                    let delay = (self.pace.backoff)(attempt);
+                    let delay = (self.times.backoff)(attempt);
                     attempt += 1;
                     self.report.link(&format!("down: {e}"));
                     self.pause(delay);
@@ -101,18 +84,18 @@ impl<'a> LinkManager<'a> {
     }
 
     fn make(&self) -> Result<Box<dyn ArmLink>, ArmError> {
-        match self.config.link {
+        match self.config.arm.link {
             LinkKind::Mock => {
                 let q = [0.0, -1.2, 1.4, -1.8, -1.57, 0.0];
-                Ok(Box::new(MockArm::new(q, MockLimits::of(self.config.model))))
+                Ok(Box::new(MockLink::new(q, MockLimits::of(self.config.arm.model))))
             }
             LinkKind::Rtde => {
                 self.report.link("connecting");
                 let config = self.ur_config();
-                // Every session may be with another arm: who it is comes before anything that could move it.
+                // The arm may be another one in each session: it is identified before anything can move it.
                 let identity = read_identity(&config)?;
-                check_model(&identity, self.config.model)?;
-                if let Kinematics::File(_, dh) = &self.config.kinematics {
+                check_model(&identity, self.config.arm.model)?;
+                if let Kinematics::File(_, dh) = &self.config.arm.kinematics {
                     check_kinematics(&identity, dh)?;
                 }
                 let mut link = UrLink::connect(&config)?;
@@ -125,12 +108,12 @@ impl<'a> LinkManager<'a> {
         }
     }
 
-    /// Returns when the link came back dead, or an operator asked for a recovery and it is done.
+    /// Waits until the command thread returns the failed link. Carries out requested recoveries meanwhile.
     fn watch(&self) {
         while !self.shared.ending() {
-            if let Some(dead) = self.shared.link_dead.take() {
-                let s = dead.stats();
-                let why = dead.fault().map_or_else(String::new, |f| format!(": {f}"));
+            if let Some(link) = self.shared.link_dead.take() {
+                let s = link.stats();
+                let why = link.fault().map_or_else(String::new, |f| format!(": {f}"));
                 self.report.link(&format!(
                     "lost after {} states and {} commands ({} states missed){why}",
                     s.received, s.sent, s.missing
@@ -139,38 +122,38 @@ impl<'a> LinkManager<'a> {
             }
             if self.recover.swap(false, Ordering::AcqRel) {
                 self.recover_now();
-                // A new session follows in any case: the old one's script is gone.
+                // The recovery has ended the session's script: a new session follows.
                 self.shared.drop_link.store(true, Ordering::Release);
             }
-            self.listen();
+            self.report_messages();
             std::thread::sleep(Duration::from_millis(10));
         }
     }
 
-    /// Takes what the controller has said.
-    fn listen(&self) {
-        if let Some(ear) = self.ear.borrow_mut().as_mut() {
-            for said in ear.listen() {
-                self.report.said(&said);
+    /// Reports the controller's new messages.
+    fn report_messages(&self) {
+        if let Some(listener) = self.messages.borrow_mut().as_mut() {
+            for message in listener.poll() {
+                self.report.controller_message(&message);
             }
         }
     }
 
-    /// Walks the controller to a running arm. The script comes with the next session, which begins idle.
+    /// Brings the controller to a running arm. The next session uploads the script and starts idle.
     fn recover_now(&self) {
-        if self.config.link != LinkKind::Rtde {
-            self.report.recovered(Ok(()));
+        if self.config.arm.link != LinkKind::Rtde {
+            self.report.recovery_ended(Ok(()));
             return;
         }
-        self.report.recovering();
-        let result = walk_out(&self.ur_config(), self.pace.recover, &mut |step| {
-            self.report.recover_step(&format!("{}: {}", step.command, step.answer));
-            self.listen();
+        self.report.recovery_started();
+        let result = walk_out(&self.ur_config(), self.times.recover, &mut |step| {
+            self.report.recovery_step(&format!("{}: {}", step.command, step.answer));
+            self.report_messages();
         });
-        self.report.recovered(result.map(drop).map_err(|e| e.to_string()));
+        self.report.recovery_ended(result.map(drop).map_err(|e| e.to_string()));
     }
 
-    /// Waits, but not longer than it takes for an operator to ask for a recovery.
+    /// Waits for `delay`, or until an operator has requested a recovery and it has ended.
     fn pause(&self, delay: Duration) {
         let until = Instant::now() + delay;
         while Instant::now() < until && !self.shared.ending() {
@@ -178,7 +161,7 @@ impl<'a> LinkManager<'a> {
                 self.recover_now();
                 return;
             }
-            self.listen();
+            self.report_messages();
             std::thread::sleep(Duration::from_millis(10));
         }
     }

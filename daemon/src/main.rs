@@ -1,4 +1,4 @@
-//! The graspd program: parses the command line, runs one subcommand, ends with its code.
+//! The graspd program: parses the command line, runs one subcommand, exits with its code.
 
 use clap::Parser;
 use graspd::cli::{self, Cli, Command};
@@ -6,12 +6,16 @@ use graspd::exit::{Exit, Failure};
 use graspd::log;
 use graspd_shm::control::Verb;
 use std::process::ExitCode;
+use std::time::Duration;
+
+/// Maximum time that the exit waits for a blocked log.
+const LOG_FLUSH_TIMEOUT: Duration = Duration::from_millis(300);
 
 fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(e) => {
-            // Help and version are no errors; clap prints both to the right stream.
+            // Help and version are not errors; clap selects the stream.
             let code = if e.use_stderr() { Exit::Usage.code() } else { 0 };
             let _ = e.print();
             return ExitCode::from(code);
@@ -19,13 +23,12 @@ fn main() -> ExitCode {
     };
     match run(cli.command) {
         Ok(exit) => {
-            log::flush(std::time::Duration::from_millis(300));
+            log::flush(LOG_FLUSH_TIMEOUT);
             ExitCode::from(exit.code())
         }
         Err(failure) => {
-            log::say(&failure);
-            // A daemon's log may be stuck; its end waits for that no longer than this.
-            log::flush(std::time::Duration::from_millis(300));
+            log::message(&failure);
+            log::flush(LOG_FLUSH_TIMEOUT);
             ExitCode::from(failure.exit.code())
         }
     }
@@ -36,10 +39,9 @@ fn run(command: Command) -> Result<Exit, Failure> {
         #[cfg(feature = "demo")]
         Command::Demo(args) => cli::demo::run(&args),
         #[cfg(not(feature = "demo"))]
-        Command::Demo(_) => Err(Failure {
-            exit: Exit::Usage,
-            message: "this build has no demo in it; build with the feature 'demo'".into(),
-        }),
+        Command::Demo(_) => {
+            Err(Failure { exit: Exit::Usage, message: "this build has no demo; build with the feature 'demo'".into() })
+        }
         Command::Plan(args) => cli::plan(&args),
         Command::Run(args) => cli::run(&args),
         Command::Check(args) => cli::check(&args),
@@ -48,14 +50,14 @@ fn run(command: Command) -> Result<Exit, Failure> {
         Command::Servo(args) => cli::send(&args, Verb::Servo, b""),
         Command::Stop(args) => cli::stop(&args),
         Command::Reset(args) => cli::send(&args, Verb::Reset, b""),
-        Command::Gripper(args) => cli::send(&args.client, Verb::Gripper, args.way.as_bytes()),
+        Command::Gripper(args) => cli::send(&args.client, Verb::Gripper, args.motion.as_bytes()),
         Command::Recover(args) => cli::recover(&args),
         Command::Setpoint(args) => cli::setpoint(&args),
         Command::Reconstruct(args) => cli::reconstruct(&args),
         Command::Study(args) => cli::study(&args),
         #[cfg(feature = "demo")]
-        Command::MockUr(p) => Ok(cli::world(graspd_hil::controller::main_with_args, "graspd-mock-ur", &p.args)),
+        Command::MockUr(p) => Ok(cli::simulator(graspd_hil::controller::main_with_args, "graspd-mock-ur", &p.args)),
         #[cfg(feature = "demo")]
-        Command::Scene(p) => Ok(cli::world(graspd_hil::scene::main_with_args, "graspd-scene", &p.args)),
+        Command::Scene(p) => Ok(cli::simulator(graspd_hil::scene::main_with_args, "graspd-scene", &p.args)),
     }
 }

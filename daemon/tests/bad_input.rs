@@ -1,5 +1,5 @@
-//! Bad input: one clear error that names file, key and fix, the documented exit code, and nothing written or moved.
-#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
+//! Invalid input: one error that names file, key and fix, the documented exit code, and no output file.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -8,7 +8,7 @@ fn example(name: &str) -> String {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/motorcycle").join(name).display().to_string()
 }
 
-/// A folder of this test's own.
+/// A new folder for one test.
 fn folder(name: &str) -> PathBuf {
     let dir = std::env::temp_dir().join(format!("graspd-test-{}-{name}", std::process::id()));
     let _ = std::fs::remove_dir_all(&dir);
@@ -20,15 +20,15 @@ fn graspd(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_graspd")).args(args).output().unwrap()
 }
 
-/// Runs it, expects this code and an error that holds every word.
-fn refused(args: &[&str], code: i32, words: &[&str]) {
+/// Runs graspd and expects this exit code and an error that contains every part.
+fn refused(args: &[&str], code: i32, parts: &[&str]) {
     let out = graspd(args);
-    let said = String::from_utf8_lossy(&out.stderr).into_owned();
-    assert_eq!(out.status.code(), Some(code), "graspd {args:?} said: {said}");
-    for word in words {
-        assert!(said.contains(word), "graspd {args:?} should name {word:?}: {said}");
+    let error = String::from_utf8_lossy(&out.stderr).into_owned();
+    assert_eq!(out.status.code(), Some(code), "graspd {args:?}: {error}");
+    for part in parts {
+        assert!(error.contains(part), "the error of graspd {args:?} does not contain {part:?}: {error}");
     }
-    assert!(!said.contains("panicked"), "{said}");
+    assert!(!error.contains("panicked"), "{error}");
 }
 
 struct Plan {
@@ -61,9 +61,9 @@ impl Plan {
             .collect()
     }
 
-    fn refused(&self, code: i32, words: &[&str]) {
+    fn refused(&self, code: i32, parts: &[&str]) {
         let args = self.args();
-        refused(&args.iter().map(String::as_str).collect::<Vec<_>>(), code, words);
+        refused(&args.iter().map(String::as_str).collect::<Vec<_>>(), code, parts);
         assert!(!self.out.exists(), "a refused plan must not leave a file");
     }
 }
@@ -77,17 +77,17 @@ fn a_missing_image_names_the_file() {
 }
 
 #[test]
-fn something_that_is_no_image_is_named() {
+fn a_file_that_is_not_an_image_is_named() {
     let dir = folder("notimage");
     let mut p = Plan::good(&dir);
     let file = dir.join("left.png");
-    std::fs::write(&file, b"this is no image").unwrap();
+    std::fs::write(&file, b"this is not an image").unwrap();
     p.left = file.display().to_string();
     p.refused(3, &["left.png"]);
 }
 
 #[test]
-fn an_image_of_the_wrong_size_says_both_sizes() {
+fn an_image_size_mismatch_names_both_sizes() {
     let dir = folder("size");
     let mut p = Plan::good(&dir);
     let file = dir.join("small.png");
@@ -97,7 +97,7 @@ fn an_image_of_the_wrong_size_says_both_sizes() {
 }
 
 #[test]
-fn malformed_toml_and_unknown_keys_name_file_and_key() {
+fn invalid_toml_and_unknown_keys_are_reported_with_file_and_key() {
     let dir = folder("toml");
     let mut p = Plan::good(&dir);
     let rig = std::fs::read_to_string(example("rig.toml")).unwrap();
@@ -110,7 +110,7 @@ fn malformed_toml_and_unknown_keys_name_file_and_key() {
 }
 
 #[test]
-fn swapped_views_are_recognised() {
+fn swapped_views_are_detected() {
     let dir = folder("swapped");
     let mut p = Plan::good(&dir);
     std::mem::swap(&mut p.left, &mut p.right);
@@ -119,7 +119,7 @@ fn swapped_views_are_recognised() {
 }
 
 #[test]
-fn a_click_far_from_any_contour_says_so() {
+fn a_click_outside_the_image_is_refused() {
     let dir = folder("far");
     let mut p = Plan::good(&dir);
     p.select[0] = "-400,-300".into();
@@ -132,7 +132,7 @@ fn a_click_far_from_any_contour_says_so() {
 }
 
 #[test]
-fn a_configuration_error_names_file_key_value_and_fix() {
+fn a_configuration_error_names_file_key_and_value() {
     let dir = folder("config");
     let config = dir.join("graspd.toml");
     let shown = config.display().to_string();
@@ -149,13 +149,21 @@ fn a_configuration_error_names_file_key_value_and_fix() {
     refused(&["check", "--config", &shown], 3, &["loop.vision_priority"]);
     write(&format!("{files}[arm]\nmodel = \"ur5e\"\n[limits]\ntcp_speed_m_s = nan\n"));
     refused(&["check", "--config", &shown], 3, &["limits.tcp_speed_m_s"]);
+    for (old, new) in
+        [("[loop]\nbeat = \"robot\"", "loop.clock"), ("[limits]\njoint_speed_rad_s = 3.0", "limits.joint_speed_rad_s")]
+    {
+        write(&format!("{files}[arm]\nmodel = \"ur5e\"\n{old}\n"));
+        for verb in ["check", "run"] {
+            refused(&[verb, "--config", &shown], 3, &["graspd.toml", new]);
+        }
+    }
     write(&format!("{files}[arm]\nmodel = \"ur5e\"\n"));
     let out = graspd(&["check", "--config", &shown]);
     assert_eq!(out.status.code(), Some(0), "{}", String::from_utf8_lossy(&out.stderr));
 }
 
 #[test]
-fn verbs_without_a_daemon_end_with_the_link_code() {
+fn verbs_without_a_daemon_exit_with_the_link_code() {
     let dir = folder("nodaemon");
     let root = dir.join("shm").display().to_string();
     for verb in ["status", "arm", "servo", "stop", "reset", "recover"] {
@@ -167,7 +175,7 @@ fn verbs_without_a_daemon_end_with_the_link_code() {
 }
 
 #[test]
-fn help_teaches_and_is_no_error() {
+fn help_and_version_are_not_errors() {
     for args in [vec!["--help"], vec!["plan", "--help"], vec!["--version"]] {
         assert_eq!(graspd(&args).status.code(), Some(0), "{args:?}");
     }

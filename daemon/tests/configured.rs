@@ -1,6 +1,7 @@
-//! What a configuration may not say, and what a daemon says of it: real processes, and the files they read.
+//! Configurations that are refused, and requests that a configured daemon refuses: real processes and the files they
+//! read.
 #![cfg(feature = "demo")]
-#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test: a failure is to be seen at once
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 
 mod cell;
 
@@ -19,11 +20,11 @@ fn graspd(folder: &Path, args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_graspd")).current_dir(folder).args(args).output().unwrap()
 }
 
-fn said(out: &Output) -> String {
+fn output(out: &Output) -> String {
     String::from_utf8_lossy(&[&out.stdout[..], b" ", &out.stderr[..]].concat()).into_owned()
 }
 
-/// Waits until the daemon's status has what is asked for.
+/// Waits until `done` is true for the daemon's status.
 fn until(world: &World, what: &str, done: impl Fn(&Value) -> bool) -> Value {
     let end = Instant::now() + Duration::from_secs(40);
     loop {
@@ -40,7 +41,7 @@ fn text<'a>(v: &'a Value, key: &str) -> &'a str {
     v.get(key).and_then(Value::as_str).unwrap_or("")
 }
 
-/// Files of a cell without its processes; gives back what `check` says of a changed configuration.
+/// The files of a cell without its processes.
 struct Files {
     world: World,
     good: String,
@@ -53,30 +54,31 @@ impl Files {
         Self { world, good }
     }
 
-    /// `check` and `run` refuse it alike, with these words, before anything starts.
-    fn refused(&self, config: &str, words: &[&str]) {
+    /// `check` and `run` both refuse `config` with a message that contains these parts, before anything starts.
+    fn refused(&self, config: &str, parts: &[&str]) {
         std::fs::write(self.world.folder.join("graspd.toml"), config).unwrap();
         for verb in ["check", "run"] {
-            let begun = Instant::now();
+            let started = Instant::now();
             let out = graspd(&self.world.folder, &[verb, "--config", "graspd.toml"]);
-            assert_eq!(out.status.code(), Some(3), "{verb}: {}", said(&out));
-            for word in words {
-                assert!(said(&out).contains(word), "{verb} should say {word}: {}", said(&out));
+            assert_eq!(out.status.code(), Some(3), "{verb}: {}", output(&out));
+            for part in parts {
+                assert!(output(&out).contains(part), "{verb} does not print {part}: {}", output(&out));
             }
-            assert!(begun.elapsed() < Duration::from_secs(5), "{verb} began something");
+            assert!(started.elapsed() < Duration::from_secs(5), "{verb} has started something");
         }
     }
 
-    fn good(&self, config: &str) -> String {
+    /// `check` accepts `config`; returns its output.
+    fn accepted(&self, config: &str) -> String {
         std::fs::write(self.world.folder.join("graspd.toml"), config).unwrap();
         let out = graspd(&self.world.folder, &["check", "--config", "graspd.toml"]);
-        assert_eq!(out.status.code(), Some(0), "{}", said(&out));
-        said(&out)
+        assert_eq!(out.status.code(), Some(0), "{}", output(&out));
+        output(&out)
     }
 }
 
 #[test]
-fn limits_are_refused_at_load_by_the_files_own_keys() {
+fn limits_are_refused_at_load_under_their_keys_in_the_file() {
     let f = Files::new(21);
     let with = |lines: &str| format!("{}[limits]\n{lines}\n", f.good);
     f.refused(&with("joint_speed_rad_s = 3.0"), &["limits.joint_speed_rad_s", "1.6", "graspd.toml"]);
@@ -88,13 +90,13 @@ fn limits_are_refused_at_load_by_the_files_own_keys() {
     );
     f.refused(&with("joint_speed_rad_s = 1.15"), &["turns a joint by", "8.6 degrees"]);
     f.refused(&with("joint_speed_rad_s = 1.0\ntcp_speed_m_s = 0.5"), &["moves the gripper by", "50.0 mm"]);
-    let said = f.good(&with("joint_accel_rad_s2 = 2.0"));
+    let text = f.accepted(&with("joint_accel_rad_s2 = 2.0"));
     // 125 cycles of the ramp and 2 of the filter, of 2 ms each.
-    assert!(said.contains("254 ms") && said.contains("degrees a joint"), "{said}");
+    assert!(text.contains("254 ms") && text.contains("degrees a joint"), "{text}");
 }
 
 #[test]
-fn the_arms_table_is_read_and_held_against_the_model_at_load() {
+fn the_kinematics_file_is_read_and_compared_with_the_model_at_load() {
     let f = Files::new(22);
     let arm = f.world.folder.join("world/arm.toml");
     let table = |scale: f64, angle: f64, five: bool| {
@@ -113,9 +115,9 @@ fn the_arms_table_is_read_and_held_against_the_model_at_load() {
         std::fs::write(&arm, text).unwrap();
     };
     table(1.0, 1.0, false);
-    assert!(f.good(&f.good).contains("arm.toml"));
+    assert!(f.accepted(&f.good).contains("arm.toml"));
     table(0.8, 1.0, false);
-    f.refused(&f.good, &["arm.toml", "mm away from a ur5e"]);
+    f.refused(&f.good, &["arm.toml", "mm away from where a ur5e has it"]);
     table(1000.0, 1.0, false);
     f.refused(&f.good, &["arm.toml", "dh.a[1]", "not mm"]);
     table(1.0, 180.0 / std::f64::consts::PI, false);
@@ -127,19 +129,19 @@ fn the_arms_table_is_read_and_held_against_the_model_at_load() {
 }
 
 #[test]
-fn open_and_close_words_that_cannot_be_told_apart_are_refused() {
+fn opening_must_reverse_closing() {
     let f = Files::new(23);
     let with = |lines: &str| format!("{}[gripper]\n{lines}\n", f.good);
-    f.refused(&with("close_set = [0]\nopen_set = [0]"), &["gripper.open_set", "opening must take back"]);
+    f.refused(&with("close_set = [0]\nopen_set = [0]"), &["gripper.open_set", "opening must clear"]);
     f.refused(&with("close_set = [0]\nopen_set = [1]"), &["gripper.open_set"]);
-    f.good(&with("close_set = [0]\nopen_clear = [0]"));
-    f.good(&with("close_set = [0]\nclose_clear = [1]\nopen_set = [1]\nopen_clear = [0]"));
-    f.good(&with("close_set = [8]"));
+    f.accepted(&with("close_set = [0]\nopen_clear = [0]"));
+    f.accepted(&with("close_set = [0]\nclose_clear = [1]\nopen_set = [1]\nopen_clear = [0]"));
+    f.accepted(&with("close_set = [8]"));
 }
 
-/// The interlock is in the controller's outputs, not in our memory; and what happens around it says what it did.
+/// The state of the gripper is read from the controller's outputs, so that a restarted daemon knows it.
 #[test]
-fn a_restarted_daemon_does_not_pull_at_a_closed_gripper() {
+fn a_restarted_daemon_does_not_servo_with_a_closed_gripper() {
     let tables = "[gripper]\nclose_set = [0]\nopen_clear = [0]\ntime_ms = 200.0\n".to_owned();
     let world = World::with(24, Extra { tables, ..Extra::default() });
     let (mock, _scene, mut daemon) = (world.mock(), world.scene(), world.daemon());
@@ -158,7 +160,7 @@ fn a_restarted_daemon_does_not_pull_at_a_closed_gripper() {
     daemon.signal(Signal::TERM);
     let end = Instant::now() + Duration::from_secs(5);
     while daemon.alive() {
-        assert!(Instant::now() < end, "it does not end");
+        assert!(Instant::now() < end, "the daemon does not end");
         std::thread::sleep(Duration::from_millis(10));
     }
     drop(daemon);
@@ -175,7 +177,7 @@ fn a_restarted_daemon_does_not_pull_at_a_closed_gripper() {
     let end = Instant::now() + Duration::from_secs(2);
     while Instant::now() < end {
         let (accepted, answer) = world.verb(&["servo"]);
-        assert!(!accepted, "it would pull at what it holds: {answer}");
+        assert!(!accepted, "it would pull at a held part: {answer}");
         std::thread::sleep(Duration::from_millis(100));
     }
     let (_, answer) = world.verb(&["servo"]);
@@ -187,7 +189,7 @@ fn a_restarted_daemon_does_not_pull_at_a_closed_gripper() {
     world.insist(&["stop"]);
 }
 
-/// A recovery asked for while armed disarms; it is not a fault.
+/// A recovery requested while armed disarms; it is not a fault.
 #[test]
 fn a_recovery_while_armed_ends_idle() {
     let world = World::new(25);
@@ -195,7 +197,7 @@ fn a_recovery_while_armed_ends_idle() {
     world.insist(&["setpoint", &world.path("plan.toml")]);
     world.insist(&["arm"]);
     let out = graspd(&world.folder, &["recover", "--config", "graspd.toml"]);
-    assert!(out.status.success(), "{}", said(&out));
+    assert!(out.status.success(), "{}", output(&out));
     for _ in 0..20 {
         let (state, cause) = world.state();
         assert!(state == "idle" || state == "tracking", "{state}: {cause}");
@@ -205,7 +207,7 @@ fn a_recovery_while_armed_ends_idle() {
     assert!(!log.contains("-> fault"), "{log}");
 }
 
-/// A request from the future never grows old: who recorded it could start a motion with it at any time.
+/// A request stamped in the future would never become too old: a recording of it could start a motion at any time.
 #[test]
 fn requests_from_the_future_and_edited_plans_are_refused() {
     let world = World::new(26);
@@ -229,8 +231,8 @@ fn requests_from_the_future_and_edited_plans_are_refused() {
         let (accepted, json) = send(verb, payload, 3_600_000_000_000);
         assert!(!accepted && json.contains("in the future"), "{verb:?}: {json}");
     }
-    assert!(send(Verb::Stop, b"", 3_600_000_000_000).0, "a stop is never too early");
-    // Every value that matters, and a comment that does not.
+    assert!(send(Verb::Stop, b"", 3_600_000_000_000).0, "a stop is accepted with any stamp");
+    // Every kind of value, and a comment, which does not matter.
     let edits: [(&str, &Edit); 5] = [
         ("opening", &|t| edit(t, "opening_m = ", "opening_m = 0.0123")),
         ("standoff", &|t| edit(t, "standoff_m = ", "standoff_m = 0.5")),
@@ -248,14 +250,14 @@ fn requests_from_the_future_and_edited_plans_are_refused() {
     ];
     for (what, make) in edits {
         let changed = make(&plan);
-        assert_ne!(changed, plan, "{what}: the test changed nothing");
+        assert_ne!(changed, plan, "{what}: the edit changed nothing");
         let (accepted, json) = send(Verb::Setpoint, changed.as_bytes(), 0);
         let why = if what == "no hash" { "written by hand" } else { "edited after it was made" };
         assert!(!accepted && json.contains(why), "{what}: {json}");
     }
     let (accepted, json) = send(Verb::Setpoint, format!("# for line 3\n{plan}").as_bytes(), 0);
-    assert!(accepted, "a comment is no edit: {json}");
-    // A configuration that is edited under a running daemon shows.
+    assert!(accepted, "a comment is not an edit: {json}");
+    // A configuration that is edited while the daemon runs is listed.
     let file = world.folder.join("graspd.toml");
     let before = std::fs::read_to_string(&file).unwrap();
     std::fs::write(&file, before + "# later\n").unwrap();
@@ -264,10 +266,10 @@ fn requests_from_the_future_and_edited_plans_are_refused() {
     assert!(changed.len() == 1 && changed[0].as_str().unwrap().ends_with("graspd.toml"), "{status}");
 }
 
-/// What an operator does to a plan in an editor.
+/// An edit of a plan.
 type Edit = dyn Fn(&str) -> String;
 
-/// The first line that begins with `key` becomes `line`.
+/// Replaces the first line that begins with `key` by `line`.
 fn edit(text: &str, key: &str, line: &str) -> String {
     let mut done = false;
     text.lines().fold(String::new(), |all, l| {
@@ -277,7 +279,7 @@ fn edit(text: &str, key: &str, line: &str) -> String {
     })
 }
 
-/// The arm is asked who it is whatever file its kinematics come from.
+/// The arm is identified also when its kinematics come from a file.
 #[test]
 fn another_model_is_refused_with_a_kinematics_file_as_well() {
     let world = World::new(27);
@@ -290,19 +292,19 @@ fn another_model_is_refused_with_a_kinematics_file_as_well() {
     assert!(!accepted, "{answer}");
 }
 
-/// Cameras that show nothing: the refusal of `arm` says what status says.
+/// Without images the refusal of `arm` names the missing images.
 #[test]
-fn a_refused_arm_says_what_is_known() {
+fn a_refusal_of_arm_names_the_state_of_the_images() {
     let world = World::new(28);
     let (_mock, _daemon) = (world.mock(), world.daemon());
     until(&world, "link up", |s| text(s, "robot") == "up");
     let (accepted, answer) = world.verb(&["arm"]);
     let reason = text(&answer, "reason");
-    assert!(!accepted && reason.contains("no usable image has come yet"), "{reason}");
+    assert!(!accepted && reason.contains("no usable image has arrived yet"), "{reason}");
 }
 
 #[test]
-fn a_plan_does_not_overwrite_what_it_is_made_from() {
+fn a_plan_does_not_overwrite_its_inputs() {
     let world = World::new(29);
     let f = &world.folder;
     std::fs::hard_link(f.join("left.png"), f.join("again.png")).unwrap();
@@ -326,18 +328,17 @@ fn a_plan_does_not_overwrite_what_it_is_made_from() {
     ] {
         let before = std::fs::read(f.join(file)).unwrap();
         let out = graspd(f, &[&base[..], &click[..], &[option, file]].concat());
-        assert_eq!(out.status.code(), Some(2), "{}", said(&out));
-        assert!(said(&out).contains(option) && said(&out).contains(input), "{}", said(&out));
+        assert_eq!(out.status.code(), Some(2), "{}", output(&out));
+        assert!(output(&out).contains(option) && output(&out).contains(input), "{}", output(&out));
         assert_eq!(std::fs::read(f.join(file)).unwrap(), before, "{file} was overwritten");
     }
     let out = graspd(f, &["reconstruct", "world/rig.toml", "--out", "world/rig.toml"]);
-    assert_eq!(out.status.code(), Some(2), "{}", said(&out));
+    assert_eq!(out.status.code(), Some(2), "{}", output(&out));
 }
 
-/// A relative root means one place, from whatever folder the programs are started, and whatever the path to it looks
-/// like.
+/// A relative root is the same folder for programs that are started in different folders, however the path is written.
 #[test]
-fn a_relative_root_is_one_place() {
+fn a_relative_root_is_the_same_folder_for_every_program() {
     let world = World::new(30);
     let (parent, name) = (world.folder.parent().unwrap(), world.folder.file_name().unwrap().to_str().unwrap());
     let from_parent = format!("{name}/graspd.toml");
@@ -345,10 +346,10 @@ fn a_relative_root_is_one_place() {
     let by_sub = world.folder.join("world");
     for (folder, config) in [(parent, &from_parent[..]), (parent, &by_dots), (&by_sub, "../graspd.toml")] {
         let out = graspd(folder, &["check", "--config", config]);
-        assert!(out.status.success(), "{config}: {}", said(&out));
+        assert!(out.status.success(), "{config}: {}", output(&out));
         let out = graspd(folder, &["status", "--config", config, "--timeout", "0.2"]);
-        assert!(said(&out).contains("no daemon"), "{config}: {}", said(&out));
+        assert!(output(&out).contains("no daemon"), "{config}: {}", output(&out));
     }
     let out = graspd(parent, &["status", "--shm-root", &format!("{name}/shm"), "--cell", "kill", "--timeout", "0.2"]);
-    assert!(said(&out).contains("no daemon"), "{}", said(&out));
+    assert!(output(&out).contains("no daemon"), "{}", output(&out));
 }

@@ -1,19 +1,20 @@
-//! Killing any one of the three processes at a random instant of the motion stops the arm, leaves the others alive with a named reason,
-//! and what comes back never moves by itself.
+//! One of the three processes is killed at a random time of the motion: the arm stops, the others stay alive and report
+//! the cause, and a restarted process does not move the arm.
 //!
-//! One round in a test run; `GRASPD_KILLS=30 cargo test --release -p graspd --test kill_any_process -- --nocapture` plays more.
+//! One round by default; `GRASPD_KILLS=30 cargo test --release -p graspd --test kill_any_process -- --nocapture` for
+//! more.
 #![cfg(feature = "demo")]
-#![allow(clippy::unwrap_used)] // a test: a failure is to be seen at once
+#![allow(clippy::unwrap_used)] // a failure must panic
 
 mod cell;
 
 use cell::{Process, World, ask, summary};
 use std::time::{Duration, SystemTime};
 
-/// Instants of the motion: SplitMix64 from the time of day, which is printed.
-struct Instants(u64);
+/// Random times of the motion: SplitMix64, seeded with the time of day, which is printed.
+struct Times(u64);
 
-impl Instants {
+impl Times {
     fn next(&mut self) -> Duration {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
@@ -23,11 +24,11 @@ impl Instants {
     }
 }
 
-/// The last episode of motion, which must be over: when it began to rest, and the last heartbeat before that, ms apart.
+/// Time from the last heartbeat to rest in the last episode of motion, ms.
 fn time_to_rest(mock: &Process) -> f64 {
     let seen = summary(mock);
     let last = seen["episodes"].as_array().unwrap().last().unwrap().clone();
-    assert!(last["peak_rate"].as_f64().unwrap() > 0.005, "it was moving: {last}");
+    assert!(last["peak_rate"].as_f64().unwrap() > 0.005, "the arm moved: {last}");
     let (rest, heartbeat) = (last["rest_ns"].as_u64().unwrap(), last["last_heartbeat_ns"].as_u64().unwrap());
     assert!(rest > 0, "the arm is at rest: {last}");
     rest.saturating_sub(heartbeat) as f64 * 1e-6
@@ -37,41 +38,41 @@ fn episodes(mock: &Process) -> u64 {
     summary(mock)["episode_count"].as_u64().unwrap()
 }
 
-/// Back to the start of the way, so that every round has one.
+/// Moves the arm to its start, so that every round has a motion.
 fn rewind(world: &World, mock: &Process) {
-    let said = ask(mock, &format!(r#"{{"cmd":"teleport","q":[{}]}}"#, world.joints));
-    assert_eq!(said["ok"], true, "{said}");
+    let answer = ask(mock, &format!(r#"{{"cmd":"teleport","q":[{}]}}"#, world.joints));
+    assert_eq!(answer["ok"], true, "{answer}");
     std::thread::sleep(Duration::from_millis(300));
     if world.state().0 == "fault" {
         world.clear();
     }
 }
 
-/// The text that the daemon's log has gained since.
+/// The text that was added to the daemon's log.
 fn since(log: &str, before: usize) -> &str {
     log.get(before..).unwrap_or(log)
 }
 
 #[test]
-fn any_process_may_be_killed_at_any_moment_of_the_motion() {
+fn any_process_may_be_killed_at_any_time_of_the_motion() {
     let rounds = std::env::var("GRASPD_KILLS").ok().and_then(|n| n.parse().ok()).unwrap_or(1);
     let seed = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap().as_nanos() as u64;
-    println!("instants from {seed}");
-    let mut instants = Instants(seed);
+    println!("seed {seed}");
+    let mut times = Times(seed);
     let world = World::new(11);
     let (mut mock, mut scene, mut daemon) = (world.mock(), world.scene(), world.daemon());
     for round in 0..rounds {
-        // The daemon: the robot's own side stops the arm.
-        let at = instants.next();
+        // The daemon: the control script and the watchdog stop the arm.
+        let at = times.next();
         world.servo(at);
         daemon.kill();
         std::thread::sleep(Duration::from_millis(700));
         let stop_ms = time_to_rest(&mock);
         println!("round {round}: daemon killed after {at:?}: at rest {stop_ms:.1} ms after its last heartbeat");
-        // 50 ms watchdog, 125 ms ramp from full speed, and what a stalled host adds to the mock's own heartbeat.
+        // 50 ms watchdog, 125 ms ramp from full speed, and a margin for a stalled host.
         assert!(stop_ms < 50.0 + 125.0 + 125.0, "{stop_ms} ms");
         assert!(mock.alive() && scene.alive());
-        // A restart is idle and moves nothing by itself.
+        // A restarted daemon is idle and does not move the arm.
         let before = episodes(&mock);
         daemon = world.daemon();
         std::thread::sleep(Duration::from_secs(2));
@@ -80,8 +81,8 @@ fn any_process_may_be_killed_at_any_moment_of_the_motion() {
         assert_eq!(episodes(&mock), before, "a restart must not move the arm");
         rewind(&world, &mock);
 
-        // The cameras: a named reason, the others alive.
-        let at = instants.next();
+        // The cameras: the cause is reported, the others stay alive.
+        let at = times.next();
         let before = world.log().len();
         world.servo(at);
         scene.kill();
@@ -92,14 +93,14 @@ fn any_process_may_be_killed_at_any_moment_of_the_motion() {
         assert!(daemon.alive() && mock.alive());
         scene = world.scene();
         std::thread::sleep(Duration::from_millis(500));
-        assert_ne!(world.state().0, "servoing", "images that come back start nothing");
+        assert_ne!(world.state().0, "servoing", "new images do not start a motion");
         if world.state().0 == "fault" {
             world.clear();
         }
         rewind(&world, &mock);
 
-        // The controller: a named reason, the others alive.
-        let at = instants.next();
+        // The controller: the cause is reported, the others stay alive.
+        let at = times.next();
         let before = world.log().len();
         world.servo(at);
         assert_eq!(summary(&mock)["limit_violations"].as_u64(), Some(0));
@@ -109,10 +110,10 @@ fn any_process_may_be_killed_at_any_moment_of_the_motion() {
         assert!(["F-ARM-01", "F-ARM-02", "F-ARM-03"].iter().any(|c| new.contains(c)), "{new}");
         println!("round {round}: controller killed after {at:?}: {}", world.state().1);
         assert!(daemon.alive() && scene.alive());
-        // And back: it connects again, and stays where it is.
+        // The daemon connects to a new controller and does not move it.
         mock = world.mock();
         std::thread::sleep(Duration::from_secs(3));
-        assert_eq!(episodes(&mock), 0, "a controller that comes back is not moved");
+        assert_eq!(episodes(&mock), 0, "a restarted controller is not moved");
         world.clear();
     }
     drop((daemon, scene, mock));

@@ -1,10 +1,11 @@
-//! SIGKILL and SIGSTOP of the real daemon at random instants of the motion: the arm rests within 50 ms and its ramp, by the mock's
-//! wire record and on the mock's own clock, and a daemon that is let go again moves nothing and names the reason.
+//! SIGKILL and SIGSTOP of the real daemon at random times of the motion: the arm starts to decelerate within 50 ms and
+//! comes to rest, by the mock's wire record and clock, and a daemon that is continued reports the cause and does not
+//! move the arm.
 //!
-//! A few of each by default; `GRASPD_KILLS=100 cargo test --release -p graspd --test kill_daemon -- --nocapture` for the full run,
-//! `GRASPD_MOTION=position` for the same with `servoj`.
+//! Two of each by default; `GRASPD_KILLS=100 cargo test --release -p graspd --test kill_daemon -- --nocapture` for the
+//! full run, `GRASPD_MOTION=position` for the same with `servoj`.
 #![cfg(feature = "demo")]
-#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test: a failure is to be seen at once
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 
 mod cell;
 #[path = "cell/wire.rs"]
@@ -16,27 +17,28 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 use wire::{Entry, Wire};
 
-/// Without a heartbeat for this long the arm must be slowing down, s.
-const REACTION_S: f64 = 0.050;
-/// Slower than this is rest, rad/s.
-const REST: f64 = 1e-3;
+/// Maximum time from the last heartbeat to the start of the ramp, s.
+const MAX_REACTION_S: f64 = 0.050;
+/// Maximum speed of an arm at rest, rad/s.
+const MAX_REST_SPEED: f64 = 1e-3;
 /// Deceleration of the ramp, rad/s2: `limits.joint_accel_rad_s2`.
 const RAMP: f64 = 4.0;
-/// What the drives need behind their targets until they rest, s.
-const SETTLE_S: f64 = 0.070;
+/// Maximum time from the targets' rest to the drives' rest, s.
+const MAX_SETTLE_S: f64 = 0.070;
 
-/// How one stop went, by the wire record.
+/// One stop, by the wire record.
 #[derive(Clone, Copy, Debug)]
 struct Stop {
     /// Fastest joint's target speed at the last heartbeat, rad/s.
     speed: f64,
-    /// From the last heartbeat to the first step of the ramp, s.
+    /// Time from the last heartbeat to the first step of the ramp, s.
     reaction_s: f64,
-    /// From there to rest, s.
+    /// Time from there to rest, s.
     ramp_s: f64,
 }
 
-/// Judges what follows the last heartbeat of `entries`; in words why this was no stop out of motion.
+/// Measures the stop after the last heartbeat of `entries`. An error that begins with a capital letter is a failure;
+/// any other says that the arm was not in motion.
 fn judge(entries: &[Entry]) -> Result<Stop, String> {
     let mut last = (None, 0);
     for (i, e) in entries.iter().enumerate() {
@@ -60,26 +62,27 @@ fn judge(entries: &[Entry]) -> Result<Stop, String> {
     let after = steps(after);
     let speed = after.first().ok_or("no step after the last heartbeat")?.1;
     if speed < 0.02 {
-        return Err(format!("the arm stood still or crept: {speed:.4} rad/s"));
+        return Err(format!("the arm was at rest or slow: {speed:.4} rad/s"));
     }
-    let rest = after.iter().position(|s| s.1 < REST && s.2 < REST);
+    let rest = after.iter().position(|s| s.1 < MAX_REST_SPEED && s.2 < MAX_REST_SPEED);
     let rest =
         rest.ok_or_else(|| format!("NOT AT REST within {:.3} s", after.last().map_or(0.0, |s| s.0) - heartbeat.0))?;
-    // A count of the encoder in one step looks like 3 mrad/s: the last of them settle.
-    if let Some(again) = after[rest..].iter().find(|s| s.1 >= REST || s.2 >= 20.0 * REST) {
+    // One encoder count in a step is 3 mrad/s: the last counts arrive while the drives settle.
+    if let Some(again) = after[rest..].iter().find(|s| s.1 >= MAX_REST_SPEED || s.2 >= 20.0 * MAX_REST_SPEED) {
         return Err(format!("MOVED AGAIN: {again:?}"));
     }
-    // Back from rest along the slope: the ramp begins where the speed was last held.
-    let begin = (1..=rest).rev().find(|&k| after[k].1 > REST && after[k - 1].1 < after[k].1 + 0.3 * RAMP * 0.002);
+    // Back from rest along the slope: the ramp begins where the speed was last constant.
+    let begin =
+        (1..=rest).rev().find(|&k| after[k].1 > MAX_REST_SPEED && after[k - 1].1 < after[k].1 + 0.3 * RAMP * 0.002);
     let begin = begin.unwrap_or(0);
     let reaction_s = after[begin].0 - heartbeat.0;
     if reaction_s < 0.010 {
-        return Err(format!("it was being stopped already: the ramp began after {:.0} ms", reaction_s * 1e3));
+        return Err(format!("it was already stopping: the ramp began after {:.0} ms", reaction_s * 1e3));
     }
     Ok(Stop { speed, reaction_s, ramp_s: after[rest].0 - after[begin].0 })
 }
 
-/// Reads on until the controller's clock is well past the last heartbeat: a stalled host stalls that clock as well.
+/// Reads until the controller's clock is 0.6 s past the last heartbeat: a stalled host stalls that clock as well.
 fn read_past_the_stop(wire: &mut Wire) -> Vec<Entry> {
     let (mut entries, start) = (wire.read(), Instant::now());
     loop {
@@ -98,7 +101,7 @@ fn read_past_the_stop(wire: &mut Wire) -> Vec<Entry> {
     }
 }
 
-/// Repeatable randomness.
+/// Seeded random numbers.
 struct Random(u64);
 
 impl Random {
@@ -108,18 +111,18 @@ impl Random {
     }
 }
 
-/// What was seen.
+/// The results of all stops.
 #[derive(Default)]
 struct Tally {
     stops: BTreeMap<&'static str, Vec<Stop>>,
     reasons: BTreeMap<String, u32>,
-    passed_over: BTreeMap<String, u32>,
+    skipped: BTreeMap<String, u32>,
 }
 
 impl Tally {
-    /// Takes one verdict. What no stopped arm may do fails; an instant without motion is passed over.
-    fn note(&mut self, signal: &'static str, verdict: Result<Stop, String>) -> bool {
-        match verdict {
+    /// Records one result. Fails on a failure; a stop without motion is skipped.
+    fn record(&mut self, signal: &'static str, result: Result<Stop, String>) -> bool {
+        match result {
             Ok(s) => {
                 let n = self.stops.get(signal).map_or(0, Vec::len) + 1;
                 println!(
@@ -128,15 +131,15 @@ impl Tally {
                     s.reaction_s * 1e3,
                     s.ramp_s * 1e3
                 );
-                assert!(s.reaction_s <= REACTION_S + 1e-9, "{signal}: {s:?}");
-                assert!(s.ramp_s <= s.speed / RAMP + SETTLE_S, "{signal}: {s:?}");
+                assert!(s.reaction_s <= MAX_REACTION_S + 1e-9, "{signal}: {s:?}");
+                assert!(s.ramp_s <= s.speed / RAMP + MAX_SETTLE_S, "{signal}: {s:?}");
                 self.stops.entry(signal).or_default().push(s);
                 true
             }
             Err(e) => {
                 assert!(!e.starts_with(char::is_uppercase), "{signal}: {e}");
-                println!("{signal}: passed over, {e}");
-                *self.passed_over.entry(e.split(':').next().unwrap_or_default().to_owned()).or_default() += 1;
+                println!("{signal}: skipped, {e}");
+                *self.skipped.entry(e.split(':').next().unwrap_or_default().to_owned()).or_default() += 1;
                 false
             }
         }
@@ -149,19 +152,20 @@ impl Tally {
                 v.sort_by(f64::total_cmp);
                 println!("{signal} {name}: min {:.1}  median {:.1}  max {:.1}", v[0], v[v.len() / 2], v[v.len() - 1]);
             };
-            println!("{signal}: {} stops out of motion, all in bound", stops.len());
+            println!("{signal}: {} stops in motion, all within bounds", stops.len());
             column("speed at the last heartbeat, mrad/s", &|s| s.speed * 1e3);
             column("last heartbeat to ramp, ms", &|s| s.reaction_s * 1e3);
             column("ramp to rest, ms", &|s| s.ramp_s * 1e3);
             column("last heartbeat to rest, ms", &|s| (s.reaction_s + s.ramp_s) * 1e3);
         }
-        println!("named after SIGCONT: {:?}", self.reasons);
-        println!("instants passed over: {:?}", self.passed_over);
+        println!("causes after SIGCONT: {:?}", self.reasons);
+        println!("skipped: {:?}", self.skipped);
     }
 }
 
-/// The daemon comes back from a freeze: the arm stays where it is, and the reason has a code. Then an operator leads it back to idle.
-fn let_go(world: &World, daemon: &Process, wire: &mut Wire, tally: &mut Tally) {
+/// Continues a stopped daemon: the arm stays at rest, and the cause has a code. Then the daemon is brought back to
+/// idle.
+fn resume(world: &World, daemon: &Process, wire: &mut Wire, tally: &mut Tally) {
     daemon.signal(Signal::CONT);
     std::thread::sleep(Duration::from_millis(500));
     let (state, cause) = world.state();
@@ -172,12 +176,12 @@ fn let_go(world: &World, daemon: &Process, wire: &mut Wire, tally: &mut Tally) {
     world.insist(&["recover"]);
     world.clear();
     std::thread::sleep(Duration::from_millis(100));
-    let moved = wire.read().into_iter().find(|e| matches!(e, Entry::Step { target, .. } if *target >= REST));
-    assert_eq!(moved, None, "nothing moves by being let go, recovered or reset");
+    let moved = wire.read().into_iter().find(|e| matches!(e, Entry::Step { target, .. } if *target >= MAX_REST_SPEED));
+    assert_eq!(moved, None, "the arm moved by SIGCONT, recovery or reset");
 }
 
 #[test]
-fn the_arm_rests_in_bound_whenever_the_daemon_is_killed_or_frozen() {
+fn the_arm_comes_to_rest_within_bounds_when_the_daemon_is_killed_or_stopped() {
     let number = |name: &str| std::env::var(name).ok().and_then(|v| v.parse::<usize>().ok());
     let count = number("GRASPD_KILLS").unwrap_or(2);
     let mut random = Random(number("GRASPD_SEED").unwrap_or(20) as u64);
@@ -195,29 +199,29 @@ fn the_arm_rests_in_bound_whenever_the_daemon_is_killed_or_frozen() {
         if killed >= count && frozen >= count {
             break;
         }
-        // Every life begins at the start of the way.
+        // Every daemon starts with the arm at the start of its path.
         ask(&mock, &format!(r#"{{"cmd":"teleport","q":[{}]}}"#, world.joints));
         let mut daemon = world.daemon();
         if frozen < count {
             world.servo(Duration::from_secs_f64(random.within(0.3, 2.2)));
             daemon.signal(Signal::STOP);
-            if !tally.note("SIGSTOP", judge(&read_past_the_stop(&mut wire))) {
+            if !tally.record("SIGSTOP", judge(&read_past_the_stop(&mut wire))) {
                 daemon.kill();
                 continue;
             }
             frozen += 1;
-            let_go(&world, &daemon, &mut wire, &mut tally);
+            resume(&world, &daemon, &mut wire, &mut tally);
         }
         if killed < count {
             world.servo(Duration::from_secs_f64(random.within(0.3, 2.2)));
             daemon.kill();
-            killed += usize::from(tally.note("SIGKILL", judge(&read_past_the_stop(&mut wire))));
+            killed += usize::from(tally.record("SIGKILL", judge(&read_past_the_stop(&mut wire))));
         }
         daemon.kill();
         wire.read();
     }
     tally.print();
-    assert_eq!((killed, frozen), (count, count), "too few instants out of motion");
+    assert_eq!((killed, frozen), (count, count), "too few stops in motion");
     let folder = world.folder.clone();
     drop((mock, scene));
     let _ = std::fs::remove_dir_all(folder);

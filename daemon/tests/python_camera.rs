@@ -1,7 +1,7 @@
-//! A camera driver in another language feeds the daemon: `shm/python/publish_stereo.py`, with PyPI's iceoryx2 in an environment of its
-//! own, publishes a pair that shows the gripper; the daemon finds the marks in it and is ready to be armed.
+//! A camera driver in another language: `shm/python/publish_stereo.py`, with iceoryx2 from PyPI in a virtual
+//! environment, publishes a pair that shows the gripper; the daemon finds the marks and can be armed.
 #![cfg(feature = "demo")]
-#![allow(clippy::unwrap_used)] // a test: a failure is to be seen at once
+#![allow(clippy::unwrap_used)] // a failure must panic
 
 mod cell;
 
@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Runs a command for at most `limit`; its standard error on failure.
+/// Runs a command for at most `limit`; returns its standard error on failure.
 fn run(mut c: Command, limit: Duration) -> Result<(), String> {
     let mut child = c.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().map_err(|e| e.to_string())?;
     let end = Instant::now() + limit;
@@ -28,7 +28,7 @@ fn run(mut c: Command, limit: Duration) -> Result<(), String> {
             None if Instant::now() > end => {
                 let _ = child.kill();
                 let _ = child.wait();
-                return Err("took too long".into());
+                return Err("timeout".into());
             }
             None => std::thread::sleep(Duration::from_millis(50)),
         }
@@ -58,7 +58,7 @@ fn python() -> Result<PathBuf, String> {
 }
 
 #[test]
-fn a_python_driver_feeds_the_daemon() {
+fn the_daemon_tracks_images_of_a_python_driver() {
     let exe = match python() {
         Ok(p) => p,
         Err(e) if std::env::var_os("CI").is_none() => {
@@ -68,10 +68,10 @@ fn a_python_driver_feeds_the_daemon() {
         Err(e) => panic!("in CI the Python camera must be tested: {e}"),
     };
     let world = World::new(13);
-    for eye in ["left", "right"] {
-        let image = image::open(world.path(&format!("{eye}.png"))).unwrap().into_luma8();
+    for view in ["left", "right"] {
+        let image = image::open(world.path(&format!("{view}.png"))).unwrap().into_luma8();
         assert_eq!(image.dimensions(), (1280, 1024));
-        std::fs::write(world.path(&format!("{eye}.raw")), image.into_raw()).unwrap();
+        std::fs::write(world.path(&format!("{view}.raw")), image.into_raw()).unwrap();
     }
     let (mock, daemon) = (world.mock(), world.daemon());
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shm/python/publish_stereo.py");
@@ -89,11 +89,11 @@ fn a_python_driver_feeds_the_daemon() {
         std::thread::sleep(Duration::from_millis(100));
         last = world.state();
     }
-    // The state may come with the very first images; that they go on coming takes a few more.
-    let (_, mut said) = world.verb(&["status"]);
-    while said["frames"].as_u64().unwrap_or(0) <= 5 && Instant::now() < until {
+    // The state may change with the first images already; a few more show that they keep arriving.
+    let (_, mut status) = world.verb(&["status"]);
+    while status["frames"].as_u64().unwrap_or(0) <= 5 && Instant::now() < until {
         std::thread::sleep(Duration::from_millis(100));
-        said = world.verb(&["status"]).1;
+        status = world.verb(&["status"]).1;
     }
     if last.0 == "tracking" {
         world.insist(&["setpoint", &world.path("plan.toml")]);
@@ -101,8 +101,8 @@ fn a_python_driver_feeds_the_daemon() {
     }
     let _ = camera.kill();
     let _ = camera.wait();
-    assert_eq!(last.0, "tracking", "{said}");
-    assert!(said["frames"].as_u64().unwrap() > 5 && said["frames_refused"].as_u64() == Some(0), "{said}");
+    assert_eq!(last.0, "tracking", "{status}");
+    assert!(status["frames"].as_u64().unwrap() > 5 && status["frames_refused"].as_u64() == Some(0), "{status}");
     drop((mock, daemon));
     let _ = std::fs::remove_dir_all(&world.folder);
 }

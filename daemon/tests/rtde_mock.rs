@@ -1,6 +1,6 @@
-//! The UR link and the control script against the mock controller, over loopback TCP: identity, upload, motion, a cycle that
-//! stops, a protective stop and the way back. Every wait is bounded.
-#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
+//! The UR link and the control script against the mock controller, over loopback TCP: identity, upload, motion, a
+//! heartbeat that stops, a protective stop and the recovery from it. Every wait is bounded.
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 #![cfg(feature = "demo")]
 
 use std::net::{IpAddr, Ipv4Addr};
@@ -17,7 +17,7 @@ use graspd_rt::rtde::script_state;
 
 const LIMIT: Duration = Duration::from_secs(20);
 
-/// A mock controller on a loopback address of its own, and the configuration that leads there.
+/// A mock controller on a separate loopback address, and the configuration of its client.
 struct Mock {
     config: UrConfig,
     stop: Arc<AtomicBool>,
@@ -40,7 +40,7 @@ impl Mock {
         let stop = Arc::new(AtomicBool::new(false));
         let stopped = Arc::clone(&stop);
         let thread = Some(std::thread::spawn(move || server.run(&stopped)));
-        // A stalled host must not look like a dead client; the usual patience has a test of its own.
+        // A stalled host must not look like a dead client; another test uses the default watchdog.
         let config = UrConfig { watchdog_ms: 500.0, ..UrConfig::new(address.to_string(), Model::Ur5e) };
         Mock { config, stop, thread }
     }
@@ -55,7 +55,7 @@ impl Drop for Mock {
     }
 }
 
-/// Commands on the robot's own cycle until `done`.
+/// Sends a command for each of the robot's packages until `done`.
 fn drive(link: &mut UrLink, mode: ArmMode, rate: f64, outputs: u32, done: impl Fn(&RobotState) -> bool) -> RobotState {
     let start = Instant::now();
     let mut cycle = link.state().map_or(0, |s| s.echo);
@@ -72,8 +72,8 @@ fn drive(link: &mut UrLink, mode: ArmMode, rate: f64, outputs: u32, done: impl F
     panic!("not reached within {LIMIT:?}: {:?}", link.state());
 }
 
-/// Listens without a word until `done`.
-fn listen(link: &mut UrLink, done: impl Fn(&RobotState) -> bool) -> RobotState {
+/// Receives without sending until `done`.
+fn receive(link: &mut UrLink, done: impl Fn(&RobotState) -> bool) -> RobotState {
     let start = Instant::now();
     while start.elapsed() < LIMIT {
         link.wait(now_ns() + 20_000_000);
@@ -99,7 +99,7 @@ fn both_motions_drive_the_arm_and_a_lost_heartbeat_stops_it() {
 
         let mut link = UrLink::connect(&mock.config).unwrap();
         link.bring_up(&mock.config).unwrap();
-        // Motion is asked for before the handshake: nothing may move.
+        // A command to move before the handshake must not move the arm.
         let q0 = link.state().unwrap().q[5];
         let mut steps = 0;
         while steps < 50 {
@@ -117,11 +117,11 @@ fn both_motions_drive_the_arm_and_a_lost_heartbeat_stops_it() {
         let stopped = drive(&mut link, ArmMode::Stop, 0.0, 0x0001_0001, |s| at_rest(s) && s.digital_outputs & 1 == 1);
         assert_eq!(stopped.script_state, script_state::STOPPING);
 
-        // The cycle ends in full motion: the arm comes to rest by itself, and the program ends.
+        // The heartbeat ends in full motion: the arm comes to rest by itself, and the program ends.
         drive(&mut link, ArmMode::Velocity, 0.4, 0x0001_0001, |s| s.qd[5] > 0.2);
-        let rest = listen(&mut link, |s| at_rest(s) && s.robot_status_bits & 2 == 0);
+        let rest = receive(&mut link, |s| at_rest(s) && s.robot_status_bits & 2 == 0);
         assert!(rest.digital_outputs & 1 == 1);
-        // Asking again moves nothing: the script is gone until somebody uploads it.
+        // New commands do not move the arm: the script has ended and has to be uploaded again.
         for _ in 0..20 {
             link.wait(now_ns() + 20_000_000);
             link.poll(now_ns());
@@ -132,7 +132,7 @@ fn both_motions_drive_the_arm_and_a_lost_heartbeat_stops_it() {
 }
 
 #[test]
-fn a_new_session_starts_where_a_lost_one_ended() {
+fn a_new_session_follows_a_lost_one() {
     let mock = Mock::start(None);
     let mut tokens = Vec::new();
     for _ in 0..3 {
@@ -147,23 +147,23 @@ fn a_new_session_starts_where_a_lost_one_ended() {
 }
 
 #[test]
-fn recovery_walks_from_a_protective_stop_to_an_idle_script() {
+fn recovery_leads_from_a_protective_stop_to_an_idle_script() {
     let mock = Mock::start(Some(Command::ProtectiveStop));
     let mut link = UrLink::connect(&mock.config).unwrap();
     let refused = link.bring_up(&mock.config).unwrap_err();
     assert!(refused.to_string().contains("graspd recover"), "{refused}");
-    let mut told = Vec::new();
-    recover(&mock.config, link.token(), |step| told.push(step.command)).unwrap();
-    assert!(told.contains(&"unlock protective stop") && told.last() == Some(&"upload"), "{told:?}");
+    let mut steps = Vec::new();
+    recover(&mock.config, link.token(), |step| steps.push(step.command)).unwrap();
+    assert!(steps.contains(&"unlock protective stop") && steps.last() == Some(&"upload"), "{steps:?}");
     let token = link.token();
-    let state = listen(&mut link, |s| s.script_token == token);
+    let state = receive(&mut link, |s| s.script_token == token);
     assert!(at_rest(&state) && state.safety_status_bits & 0b100 == 0);
     let state = drive(&mut link, ArmMode::Idle, 0.0, 0, |s| s.script_state == script_state::IDLE);
     assert_eq!(state.script_fault, 0);
 }
 
 #[test]
-fn recovery_powers_up_but_never_touches_an_emergency_stop() {
+fn recovery_powers_up_but_does_not_clear_an_emergency_stop() {
     let mock = Mock::start(Some(Command::PowerOff));
     recover(&mock.config, 5, |_| {}).unwrap();
     drop(mock);

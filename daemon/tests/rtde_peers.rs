@@ -1,5 +1,5 @@
 //! The UR link against peers that misbehave, over loopback TCP. Every wait is bounded; no time is asserted from below.
-#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -12,18 +12,18 @@ use graspd_rt::rtde::*;
 
 const LIMIT: Duration = Duration::from_secs(5);
 
-/// What a peer does.
+/// Behaviour of a peer.
 #[derive(Clone)]
 struct Peer {
-    /// Bytes of one write.
+    /// Bytes in one write.
     piece: usize,
     /// Pause between writes of the handshake.
     drip: Duration,
-    /// The type word answered for every input.
-    input_word: Option<Answer>,
-    /// Sent after the handshake and one good state.
+    /// The answer for every input variable.
+    input_answer: Option<Answer>,
+    /// Sent after the handshake and one valid state.
     then: Vec<u8>,
-    /// How it ends: by a reset, by closing, or by holding on without reading until the client goes.
+    /// How the connection ends: by a reset, by closing, or held open without reading until the client closes.
     end: End,
     connections: usize,
 }
@@ -38,7 +38,7 @@ enum End {
 impl Default for Peer {
     fn default() -> Self {
         let drip = Duration::ZERO;
-        Peer { piece: 4096, drip, input_word: None, then: Vec::new(), end: End::Hold, connections: 1 }
+        Peer { piece: 4096, drip, input_answer: None, then: Vec::new(), end: End::Hold, connections: 1 }
     }
 }
 
@@ -59,7 +59,7 @@ fn emit(message: ControllerMessage<'_>) -> Vec<u8> {
 }
 
 impl Peer {
-    /// Serves on a free port; gives the configuration that leads there.
+    /// Serves on a free port; returns the configuration of a client for it.
     fn serve(self) -> (UrConfig, JoinHandle<()>) {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let offset = listener.local_addr().unwrap().port().wrapping_sub(30004);
@@ -92,14 +92,14 @@ impl Peer {
             framer.commit(n);
             while let Ok(Some(package)) = framer.next() {
                 let types = |side, list| {
-                    let words: Vec<_> = names(list)
-                        .map(|n| match (side, self.input_word) {
-                            (Side::Input, Some(word)) => word,
+                    let answers: Vec<_> = names(list)
+                        .map(|n| match (side, self.input_answer) {
+                            (Side::Input, Some(answer)) => answer,
                             _ => Answer::Type(Field::find(side, n).unwrap().kind()),
                         })
                         .collect();
                     let mut out = vec![0u8; 4096];
-                    join(words, &mut out).unwrap().to_owned()
+                    join(answers, &mut out).unwrap().to_owned()
                 };
                 let answer = match ClientMessage::parse(Version::V2, package).unwrap() {
                     ClientMessage::RequestVersion(_) => emit(ControllerMessage::VersionAccepted(true)),
@@ -117,7 +117,7 @@ impl Peer {
                     }
                     ClientMessage::Start => {
                         started = true;
-                        // Merged on purpose: the first state travels with the answer.
+                        // In one write on purpose: the first state arrives together with the answer.
                         [emit(ControllerMessage::Started(true)), state(100.0, 7)].concat()
                     }
                     _ => Vec::new(),
@@ -127,7 +127,7 @@ impl Peer {
                 }
             }
         }
-        // The first command says that the link is set up: only then does the peer misbehave.
+        // The misbehaviour begins after the first command, when the link is set up.
         let mut command = [0u8; CommandWriter::PACKAGE];
         if stream.read_exact(&mut command).is_err() {
             return;
@@ -139,7 +139,7 @@ impl Peer {
                 rustix::net::sockopt::set_socket_linger(&stream, Some(Duration::ZERO)).unwrap();
             }
             End::Hold => {
-                // Without reading: `peek` sees the client's end and leaves the receive buffer full.
+                // Polls for the hang-up without reading, so that the receive buffer stays full.
                 stream.set_read_timeout(Some(Duration::from_millis(20))).unwrap();
                 while start.elapsed() < LIMIT && !hung_up(&stream) {
                     std::thread::sleep(Duration::from_millis(5));
@@ -149,7 +149,7 @@ impl Peer {
     }
 }
 
-/// Whether the other side has closed.
+/// Whether the client has closed.
 fn hung_up(stream: &TcpStream) -> bool {
     use rustix::event::{PollFd, PollFlags, poll};
     let mut fds = [PollFd::new(stream, PollFlags::RDHUP)];
@@ -157,14 +157,14 @@ fn hung_up(stream: &TcpStream) -> bool {
     poll(&mut fds, Some(&now)).is_ok() && !fds[0].revents().is_empty()
 }
 
-/// A link that is set up, and has told its peer so.
+/// A link that is set up and has sent its first command.
 fn connect(config: &UrConfig) -> UrLink {
     let mut link = UrLink::connect(config).unwrap();
     link.send(&ArmCommand::default()).unwrap();
     link
 }
 
-/// Polls until the link ends.
+/// Polls until the link fails.
 fn until_fault(link: &mut UrLink) -> LinkFault {
     let start = Instant::now();
     let mut now = 1_000_000;
@@ -172,8 +172,8 @@ fn until_fault(link: &mut UrLink) -> LinkFault {
         now += 2_000_000;
         if let Some(fault) = link.poll(now).fault {
             let command = ArmCommand { mode: ArmMode::Velocity, ..ArmCommand::default() };
-            assert_eq!(link.send(&command), Err(fault), "a failed link sends nothing any more");
-            assert_eq!(link.poll(now).fault, Some(fault), "and stays failed");
+            assert_eq!(link.send(&command), Err(fault), "a failed link sends nothing");
+            assert_eq!(link.poll(now).fault, Some(fault), "a failed link stays failed");
             return fault;
         }
         link.wait(graspd::realtime::now_ns() + 10_000_000);
@@ -182,7 +182,7 @@ fn until_fault(link: &mut UrLink) -> LinkFault {
 }
 
 #[test]
-fn one_byte_at_a_time_is_as_good_as_any() {
+fn a_stream_in_single_bytes_is_read() {
     let then = [state(100.002, 8), state(100.010, 9)].concat();
     let (config, peer) = Peer { piece: 1, then, ..Peer::default() }.serve();
     let mut link = connect(&config);
@@ -199,7 +199,7 @@ fn one_byte_at_a_time_is_as_good_as_any() {
 }
 
 #[test]
-fn every_kind_of_damage_ends_the_link_with_its_name() {
+fn every_kind_of_invalid_data_ends_the_link_with_its_own_fault() {
     type Expected = fn(LinkFault) -> bool;
     let cases: [(&[u8], Expected); 7] = [
         (b"\x00\x02U", |f| matches!(f, LinkFault::Framing(FrameError::TooShort { size: 2 }))),
@@ -210,7 +210,7 @@ fn every_kind_of_damage_ends_the_link_with_its_name() {
             matches!(f, LinkFault::Protocol(ClientError::Message(MessageError::NotText(_))))
         }),
         (b"\x00\x05S\x01\x01", |f| matches!(f, LinkFault::Protocol(ClientError::Message(MessageError::Length { .. })))),
-        // Truncated: states 65535 bytes, sends few, closes.
+        // Truncated: the header states 65535 bytes, and the connection closes after a few.
         (b"\xff\xffU\x01\x00\x00", |f| f == LinkFault::Closed),
     ];
     for (bytes, expected) in cases {
@@ -237,7 +237,7 @@ fn a_reset_ends_the_link() {
 
 #[test]
 fn refused_fields_and_slow_peers_fail_to_connect_with_the_reason() {
-    let (config, peer) = Peer { input_word: Some(Answer::InUse), ..Peer::default() }.serve();
+    let (config, peer) = Peer { input_answer: Some(Answer::InUse), ..Peer::default() }.serve();
     let error = UrLink::connect(&config).unwrap_err();
     assert!(error.to_string().contains("`input_int_register_24` is held by another RTDE client"), "{error}");
     peer.join().unwrap();
@@ -260,7 +260,7 @@ fn a_peer_that_never_reads_is_a_fault_and_never_blocks() {
         if let Err(fault) = link.send(&command) {
             break fault;
         }
-        assert!(link.stats().sent < 1_000_000, "a full buffer was never seen");
+        assert!(link.stats().sent < 1_000_000, "the send buffer never became full");
     };
     assert!(matches!(fault, LinkFault::SendBlocked(20_000_000..=22_000_000)), "{fault:?}");
     assert!(link.stats().dropped >= 10);
@@ -269,7 +269,7 @@ fn a_peer_that_never_reads_is_a_fault_and_never_blocks() {
 }
 
 #[test]
-fn many_reconnects_leave_nothing_behind() {
+fn many_reconnects_leave_no_descriptors_open() {
     let rounds = 100;
     let (config, peer) = Peer { end: End::Close, connections: rounds, ..Peer::default() }.serve();
     let mut tokens = std::collections::HashSet::new();
@@ -279,7 +279,7 @@ fn many_reconnects_leave_nothing_behind() {
     }
     assert_eq!(tokens.len(), rounds, "every session has its own token");
     peer.join().unwrap();
-    // Other tests of this process open sockets at the same time, but never a hundred.
+    // Other tests of this process open sockets at the same time, but fewer than a hundred.
     let open = std::fs::read_dir("/proc/self/fd").unwrap().count();
     assert!(open < rounds, "{open} descriptors are open");
 }

@@ -1,11 +1,11 @@
-//! The UR link and the recovery against the mock controller: CB3 at 125 Hz, protocol version 1, inputs that are held or unknown, outputs
-//! of the gripper, every way in which a recovery can be refused, and the controller's own words about a stop.
+//! The UR link and the recovery against the mock controller: CB3 at 125 Hz, protocol version 1, inputs that are held or
+//! unknown, outputs of the gripper, every refusal of a recovery, and the controller's messages about a stop.
 #![cfg(feature = "demo")]
-#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test: a failure is to be seen at once
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 
 use graspd::arm::{
-    ArmError, ArmLink, Ear, Motion, RecoverTimes, SaidKind, UrConfig, UrLink, check_model, read_identity, recover,
-    render, walk_out,
+    ArmError, ArmLink, MessageKind, MessageListener, Motion, RecoverTimes, UrConfig, UrLink, check_model,
+    read_identity, recover, render, walk_out,
 };
 use graspd::realtime::now_ns;
 use graspd::threads::{CommandWorker, Shared};
@@ -25,12 +25,12 @@ fn mock(model: &str, power_time_s: f64) -> (Hosted, UrConfig) {
     let mock = Hosted::start(setup, None, None).unwrap();
     let mut config = UrConfig::new(mock.address.to_string(), Model::from_name(model).unwrap());
     config.cycle_hz = if config.model.is_e_series() { 500.0 } else { 125.0 };
-    // A stalled host must not look like a dead client here; the usual patience has tests of its own.
+    // A stalled host must not look like a dead client here; other tests use the default watchdog.
     config.watchdog_ms = 1000.0;
     (mock, config)
 }
 
-/// Commands on the controller's own packages until `done`.
+/// Sends a command for each of the controller's packages until `done`.
 fn drive(link: &mut UrLink, mode: ArmMode, rate: f64, outputs: u32, done: impl Fn(&RobotState) -> bool) -> RobotState {
     let start = Instant::now();
     let mut cycle = link.state().map_or(0, |s| s.echo);
@@ -47,8 +47,8 @@ fn drive(link: &mut UrLink, mode: ArmMode, rate: f64, outputs: u32, done: impl F
     panic!("not reached within {LIMIT:?}: {:?}", link.state());
 }
 
-/// Listens without a word until `done`.
-fn listen(link: &mut UrLink, done: impl Fn(&RobotState) -> bool) -> RobotState {
+/// Receives without sending until `done`.
+fn receive(link: &mut UrLink, done: impl Fn(&RobotState) -> bool) -> RobotState {
     let start = Instant::now();
     while start.elapsed() < LIMIT {
         link.wait(now_ns() + 40_000_000);
@@ -63,8 +63,8 @@ fn at_rest(s: &RobotState) -> bool {
     s.qd.iter().chain(&s.target_qd).all(|v| v.abs() < 1e-3)
 }
 
-/// Session, script, motion, a heartbeat that ends, rest: at the controller's own rate.
-fn whole_session(mock: &mut Hosted, config: &UrConfig, version: Version, hz: f64) {
+/// Session, script, motion, end of the heartbeat, rest: at the controller's rate.
+fn complete_session(mock: &mut Hosted, config: &UrConfig, version: Version, hz: f64) {
     let identity = read_identity(config).unwrap();
     check_model(&identity, config.model).unwrap();
     let mut link = UrLink::connect(config).unwrap();
@@ -75,7 +75,7 @@ fn whole_session(mock: &mut Hosted, config: &UrConfig, version: Version, hz: f64
     let q0 = link.state().unwrap().q[5];
     let moved = drive(&mut link, ArmMode::Velocity, 0.4, 0, |s| s.q[5] - q0 > 0.1);
     assert_eq!((moved.script_fault, moved.qd[5] > 0.2), (0, true), "{moved:?}");
-    let rest = listen(&mut link, |s| at_rest(s) && s.robot_status_bits & 2 == 0);
+    let rest = receive(&mut link, |s| at_rest(s) && s.robot_status_bits & 2 == 0);
     assert!(rest.timestamp_s > moved.timestamp_s);
     let summary = mock.ask(&Command::Summary).unwrap();
     let last = summary["episodes"].as_array().unwrap().last().unwrap().clone();
@@ -84,30 +84,30 @@ fn whole_session(mock: &mut Hosted, config: &UrConfig, version: Version, hz: f64
 }
 
 #[test]
-fn cb3_runs_at_its_own_rate_in_both_motions() {
+fn cb3_runs_at_125_hz_in_both_motions() {
     for motion in [Motion::Velocity, Motion::Position] {
         let (mut mock, mut config) = mock("ur5", 0.05);
         config.motion = motion;
-        whole_session(&mut mock, &config, Version::V2, 125.0);
+        complete_session(&mut mock, &config, Version::V2, 125.0);
     }
-    // 40 ms of patience are five of its steps, and the watchdog stands two behind.
+    // The heartbeat timeout of 40 ms is five of its steps, and the watchdog is two steps later.
     let usual = UrConfig { cycle_hz: 125.0, ..UrConfig::new("localhost", Model::Ur5) };
     let text = render(&usual, 1, 0.008).unwrap();
     assert!(text.contains("PATIENCE_STEPS = 5\n") && text.contains("17.857"), "{text}");
 }
 
 #[test]
-fn a_controller_of_protocol_version_1_is_driven_all_the_same() {
+fn a_controller_of_protocol_version_1_is_supported() {
     for (model, hz) in [("ur5", 125.0), ("ur10", 125.0), ("ur5e", 500.0)] {
         let (mut mock, config) = mock(model, 0.05);
         mock.ask(&Command::RefuseV2 { on: true }).unwrap();
-        whole_session(&mut mock, &config, Version::V1, hz);
+        complete_session(&mut mock, &config, Version::V1, hz);
     }
 }
 
 #[test]
-fn recovery_follows_the_controllers_own_step() {
-    // The software tells, not the configured model.
+fn recovery_uses_the_step_of_the_controllers_software() {
+    // The software version decides, not the configured model.
     for (model, other, step_s) in [("ur5", Model::Ur5e, 0.008), ("ur5e", Model::Ur5, 0.002)] {
         let (_mock, mut config) = mock(model, 0.05);
         config.model = other;
@@ -115,14 +115,14 @@ fn recovery_follows_the_controllers_own_step() {
     }
     let (mut mock, config) = mock("ur3", 0.05);
     mock.ask(&Command::PowerOff).unwrap();
-    let mut told = Vec::new();
-    recover(&config, 5, |step| told.push(step.command)).unwrap();
+    let mut steps = Vec::new();
+    recover(&config, 5, |step| steps.push(step.command)).unwrap();
     assert_eq!(
-        told,
+        steps,
         ["close safety popup", "close popup", "safetymode", "power on", "brake release", "robotmode", "upload"]
     );
     let mut link = UrLink::connect(&config).unwrap();
-    let state = listen(&mut link, |s| s.script_token == 5);
+    let state = receive(&mut link, |s| s.script_token == 5);
     assert!(at_rest(&state) && state.script_state == script_state::WAITING);
 }
 
@@ -134,7 +134,7 @@ fn held_and_unknown_variables_are_named_with_their_likely_owner() {
     assert!(text.contains("`input_int_register_24` is held by another RTDE client (IN_USE)"), "{text}");
     assert!(text.contains("another graspd") && text.contains("ROS driver"), "{text}");
     drop(first);
-    // With its connection the other one's hold ends.
+    // The variables are free when the other connection has closed.
     let until = Instant::now() + LIMIT;
     while let Err(e) = UrLink::connect(&config) {
         assert!(Instant::now() < until, "{e}");
@@ -155,25 +155,25 @@ fn held_and_unknown_variables_are_named_with_their_likely_owner() {
 }
 
 #[test]
-fn outputs_of_controller_and_tool_are_set_on_the_way_of_the_commands() {
+fn outputs_of_controller_and_tool_are_set_by_commands() {
     let (_mock, config) = mock("ur5e", 0.05);
     let mut link = UrLink::connect(&config).unwrap();
     link.bring_up(&config).unwrap();
     drive(&mut link, ArmMode::Idle, 0.0, 0, |s| s.script_state == script_state::IDLE);
-    // Tool outputs stand at bits 16 and 17 of the controller's word, standard ones at 0 to 7.
+    // In the controller's word tool outputs are bits 16 and 17, standard outputs bits 0 to 7.
     let on = |set: u32, clear: u32| (set | clear) << 16 | set;
     drive(&mut link, ArmMode::Idle, 0.0, on(0b1_0000_0011, 0), |s| s.digital_outputs & 0x3_00ff == 0x1_0003);
-    // In motion as well, and only what the mask names.
+    // In motion as well, and only the outputs in the mask.
     drive(&mut link, ArmMode::Velocity, 0.1, on(0b10_0000_0000, 0b1), |s| s.digital_outputs & 0x3_00ff == 0x3_0002);
     drive(&mut link, ArmMode::Velocity, 0.1, on(0, 0b11_0000_0010), |s| s.digital_outputs & 0x3_00ff == 0);
-    // A word with bits that mean nothing is refused, and the arm stops.
+    // A word with undefined bits is refused, and the arm stops.
     let state = drive(&mut link, ArmMode::Velocity, 0.1, 1 << 10, |s| s.script_state == script_state::FAULT);
     assert_eq!(state.script_fault, 6);
     drive(&mut link, ArmMode::Idle, 0.0, on(1, 0), |s| s.script_fault == 0 && s.digital_outputs & 1 == 1);
 }
 
 #[test]
-fn every_refusal_of_a_recovery_says_what_to_do() {
+fn every_refusal_of_a_recovery_names_its_fix() {
     type Set = Vec<Command>;
     let cases: Vec<(Set, &str, &str)> = vec![
         (vec![Command::RemoteControl { on: false }], "local control", "Remote Control on the pendant"),
@@ -185,11 +185,11 @@ fn every_refusal_of_a_recovery_says_what_to_do() {
         (vec![Command::RobotMode { mode: RobotMode::ConfirmSafety }], "CONFIRM_SAFETY", "confirm the safety"),
         (vec![Command::RobotMode { mode: RobotMode::Backdrive }], "BACKDRIVE", "end backdrive"),
         (vec![Command::RobotMode { mode: RobotMode::Disconnected }], "DISCONNECTED", "restart it"),
-        (vec![Command::RobotMode { mode: RobotMode::Booting }], "BOOTING", "did not get power in time"),
-        // Powering takes a minute here.
-        (vec![Command::PowerOff], "POWER", "did not get power in time"),
-        (vec![Command::RobotMode { mode: RobotMode::Idle }], "IDLE", "brakes did not open in time"),
-        // Five seconds have not passed, and we wait for a third of one.
+        (vec![Command::RobotMode { mode: RobotMode::Booting }], "BOOTING", "no power after the timeout"),
+        // Powering on takes a minute here.
+        (vec![Command::PowerOff], "POWER", "no power after the timeout"),
+        (vec![Command::RobotMode { mode: RobotMode::Idle }], "IDLE", "brakes did not open within the timeout"),
+        // The unlock timeout is shorter than the controller's waiting time of five seconds.
         (vec![Command::ProtectiveStop], "5s after occurrence", "graspd status"),
         (vec![Command::Blackhole { port: Port::Dashboard, seconds: 60.0 }], "no dashboard answer", "within"),
     ];
@@ -213,30 +213,30 @@ fn every_refusal_of_a_recovery_says_what_to_do() {
 }
 
 #[test]
-fn the_controller_is_heard_saying_why_it_stopped_and_its_popups_are_closed() {
+fn messages_name_the_cause_of_a_stop_and_a_recovery_closes_popups() {
     let (mut mock, config) = mock("ur5e", 0.05);
-    let mut ear = Ear::new(&config);
-    let hear = |ear: &mut Ear, wanted: SaidKind| {
+    let mut listener = MessageListener::new(&config);
+    let receive_message = |listener: &mut MessageListener, expected: MessageKind| {
         let until = Instant::now() + LIMIT;
         loop {
-            if let Some(said) = ear.listen().into_iter().find(|s| s.kind == wanted) {
-                return said.text;
+            if let Some(message) = listener.poll().into_iter().find(|m| m.kind == expected) {
+                return message.text;
             }
-            assert!(Instant::now() < until, "{wanted:?} was not heard");
+            assert!(Instant::now() < until, "no message of kind {expected:?}");
             std::thread::sleep(Duration::from_millis(5));
         }
     };
-    ear.listen();
-    // The ear is there once the mock has greeted it.
+    listener.poll();
+    // The mock has to accept the connection.
     std::thread::sleep(Duration::from_millis(200));
     mock.ask(&Command::Script { text: "def broken():\n  nothing_of_this_name()\nend\n".into() }).unwrap();
-    let text = hear(&mut ear, SaidKind::Program);
+    let text = receive_message(&mut listener, MessageKind::Program);
     assert!(text.contains("line 2"), "{text}");
     mock.ask(&Command::Script { text: "popup(\"look here\", title=\"Stop\")\n".into() }).unwrap();
     std::thread::sleep(Duration::from_millis(100));
     mock.ask(&Command::Collision { force: 80.0 }).unwrap();
-    assert_eq!(hear(&mut ear, SaidKind::Safety), "protective stop (C153A0)");
-    // A connection that is cut is made again.
+    assert_eq!(receive_message(&mut listener, MessageKind::Safety), "protective stop (C153A0)");
+    // A reset connection is made again.
     mock.ask(&Command::Reset { port: Port::Primary }).unwrap();
     recover(&config, 3, |_| {}).unwrap();
     std::thread::sleep(Duration::from_millis(100));
@@ -244,13 +244,13 @@ fn the_controller_is_heard_saying_why_it_stopped_and_its_popups_are_closed() {
     assert!(world.robot.popup.is_none(), "a popup is left on the pendant");
 }
 
-/// Cycles until `enough` of them were noted in one go; how many links the worker was told of in them.
+/// Collects the records of at least `enough` cycles; returns the state of the link in each.
 fn cycles(shared: &Shared, enough: usize) -> Vec<u32> {
     let (start, mut links) = (Instant::now(), Vec::new());
     while links.len() < enough {
         assert!(start.elapsed() < LIMIT, "only {} cycles", links.len());
-        while let Some(note) = shared.records.pop() {
-            links.push(note.link);
+        while let Some(cycle) = shared.records.pop() {
+            links.push(cycle.link);
         }
         std::thread::sleep(Duration::from_millis(1));
     }
@@ -258,7 +258,7 @@ fn cycles(shared: &Shared, enough: usize) -> Vec<u32> {
 }
 
 #[test]
-fn a_cycle_by_the_robot_goes_on_without_it() {
+fn a_cycle_with_the_robot_as_clock_continues_without_the_robot() {
     let (mock, config) = mock("ur5e", 0.05);
     let scenario = Scenario::from_seed(1, &Options::default()).unwrap();
     let cycle = CommandCycle::new(CycleConfig {
@@ -272,19 +272,19 @@ fn a_cycle_by_the_robot_goes_on_without_it() {
     let shared = Shared::default();
     std::thread::scope(|scope| {
         scope.spawn(|| CommandWorker::new(cycle, &shared).run_with_robot(2_000_000));
-        assert!(cycles(&shared, 50).iter().all(|link| *link == 1), "a timer before there is a robot");
+        assert!(cycles(&shared, 50).iter().all(|link| *link == 1), "by a timer before the robot is connected");
         let mut link = UrLink::connect(&config).unwrap();
         link.bring_up(&config).unwrap();
         shared.link_ready.put(Box::new(link));
-        assert!(cycles(&shared, 600).ends_with(&[2; 400]), "cycles with the robot");
+        assert!(cycles(&shared, 600).ends_with(&[2; 400]), "with the robot");
         drop(mock);
         let until = Instant::now() + LIMIT;
         while !cycles(&shared, 50).ends_with(&[1]) {
-            assert!(Instant::now() < until, "the lost robot is not noticed");
+            assert!(Instant::now() < until, "the lost link is not noticed");
         }
-        assert!(cycles(&shared, 200).ends_with(&[1; 150]), "and a timer after it");
-        let dead = shared.link_dead.take().unwrap();
-        assert!(dead.fault().is_some() && dead.stats().sent > 300, "{:?}", dead.stats());
+        assert!(cycles(&shared, 200).ends_with(&[1; 150]), "by a timer after the link is lost");
+        let link = shared.link_dead.take().unwrap();
+        assert!(link.fault().is_some() && link.stats().sent > 300, "{:?}", link.stats());
         shared.shutdown.store(true, std::sync::atomic::Ordering::Release);
     });
 }

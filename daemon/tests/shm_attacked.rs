@@ -1,9 +1,10 @@
-//! The shared memory taken away under a moving daemon, and another local user who does whatever he can: the stop stays.
+//! Shared memory that is damaged while the daemon moves the arm, and attacks by another local user: the stop keeps
+//! working.
 //!
-//! Each test runs in a mount namespace with a `/dev/shm` of its own, so that it can fill and empty it; that and the
-//! second account need root. Where the tests do not run as root they say so and look at nothing.
+//! Each test runs in a mount namespace with its own `/dev/shm`, which it can fill and empty. That and the second
+//! account need root; without root the tests print that they are skipped.
 #![cfg(feature = "demo")]
-#![allow(clippy::unwrap_used)] // a test: a failure is to be seen at once
+#![allow(clippy::unwrap_used)] // a failure must panic
 
 mod cell;
 #[path = "cell/stops.rs"]
@@ -13,7 +14,7 @@ mod wire;
 
 use cell::{Extra, Process, World, ask, summary};
 use graspd::realtime::now_ns;
-use graspd::stop::{Heard, ask as ask_to_stop};
+use graspd::stop::{StopAnswer, ask as request_stop};
 use rustix::process::Signal;
 use std::os::unix::fs::MetadataExt;
 use std::os::unix::process::CommandExt;
@@ -23,17 +24,16 @@ use std::time::{Duration, Instant};
 use stops::{Cell, by_socket, ended};
 use wire::Entry;
 
-/// An account that nobody has.
-const STRANGER: u32 = 54_321;
+/// User id of the attacker; no account has it.
+const ATTACKER: u32 = 54_321;
 
-/// Runs a test again by this binary, in a mount namespace of its own. `true` in there; `false` outside, where all is
-/// done.
-fn in_a_namespace_of_its_own(test: &str) -> bool {
+/// Runs a test again in a separate mount namespace. True in the namespace; false outside, after the test has run.
+fn in_own_namespace(test: &str) -> bool {
     if std::env::var_os("GRASPD_OWN_SHM").is_some() {
         return true;
     }
     if !rustix::process::geteuid().is_root() {
-        println!("SKIPPED: {test} needs root for a /dev/shm of its own and a second account; NOTHING WAS TESTED");
+        println!("SKIPPED: {test} needs root for a separate /dev/shm and a second account; NOTHING WAS TESTED");
         return false;
     }
     let script = "mount -t tmpfs -o size=400m,mode=1777 tmpfs /dev/shm && exec \"$0\" --exact \"$1\" --nocapture";
@@ -68,7 +68,7 @@ fn middleware(root: &Path) -> Vec<PathBuf> {
     all
 }
 
-fn harm(kind: &str, root: &Path) {
+fn damage(kind: &str, root: &Path) {
     let all = middleware(root);
     assert!(all.len() > 15, "{all:?}");
     for path in all {
@@ -87,7 +87,7 @@ fn harm(kind: &str, root: &Path) {
     }
 }
 
-/// The speed that the arm's targets have at the end of what was recorded.
+/// Target speed of the fastest joint at the end of the record, rad/s.
 fn last_speed(entries: &[Entry]) -> f64 {
     let step = entries.iter().rev().find_map(|e| match e {
         Entry::Step { target, .. } => Some(*target),
@@ -97,40 +97,40 @@ fn last_speed(entries: &[Entry]) -> f64 {
 }
 
 #[test]
-fn shared_memory_deleted_overwritten_or_cut_under_a_moving_arm() {
-    if !in_a_namespace_of_its_own("shared_memory_deleted_overwritten_or_cut_under_a_moving_arm") {
+fn damaged_shared_memory_stops_a_moving_arm() {
+    if !in_own_namespace("damaged_shared_memory_stops_a_moving_arm") {
         return;
     }
-    for kind in ["deleted", "garbage", "cut to nothing"] {
+    for kind in ["deleted", "garbage", "truncated"] {
         let mut cell = Cell::new(41);
         let names = cell.names();
         let mut daemon = cell.world.daemon();
         cell.drive(Duration::from_millis(500));
         let asked = now_ns();
-        harm(kind, names.root());
-        let heard = ask_to_stop(&names);
+        damage(kind, names.root());
+        let answer = request_stop(&names);
         std::thread::sleep(Duration::from_millis(700));
         let mut entries = cell.wire.read();
-        // A daemon that lives takes the stop at once. One that the kernel killed for touching what is gone (SIGBUS) is
-        // stopped by the control script's patience: the daemon's last set-point then was no stop.
-        let alive = matches!(heard, Heard::Socket { taken: true, .. });
+        // A live daemon takes the stop immediately. If the kernel killed it for an access to missing memory (SIGBUS),
+        // the control script stops the arm after its heartbeat timeout, and the daemon's last set-point was not a stop.
+        let alive = matches!(answer, StopAnswer::Socket { taken: true, .. });
         if alive {
             stops::judge(&entries, asked).unwrap().check(&format!("shared memory {kind}, socket"));
         }
         let code = ended(&mut daemon, Duration::from_secs(10));
         entries.extend(cell.wire.read());
-        println!("shared memory {kind}: {heard:?}, exit code {code:?}, arm at {:.5} rad/s", last_speed(&entries));
+        println!("shared memory {kind}: {answer:?}, exit code {code:?}, arm at {:.5} rad/s", last_speed(&entries));
         assert!(last_speed(&entries) < 1e-3, "{kind}: still moving");
         match code {
             Some(4) => assert!(cell.world.log().contains("shared memory was damaged"), "{}", cell.world.log()),
-            // By a signal or a panic in the middleware: not in words, but stopped.
+            // Killed by a signal or by a panic in the middleware: without a message, but stopped.
             other => assert!(kind != "deleted" && other != Some(0), "{kind}: {other:?}\n{}", cell.world.log()),
         }
-        // Nobody is there any more, and that is said in bounded time.
-        let begun = Instant::now();
+        // Without a daemon the command fails within bounded time.
+        let started = Instant::now();
         assert!(!cell.world.verb(&["stop"]).0);
-        assert!(begun.elapsed() < Duration::from_secs(5), "{kind}: {:?}", begun.elapsed());
-        // A new daemon in what is left: it works, or says what is in its way; it does not hang.
+        assert!(started.elapsed() < Duration::from_secs(5), "{kind}: {:?}", started.elapsed());
+        // A new daemon in the damaged folder works or ends with an error; it does not hang.
         let left = cell.world.path("graspd.toml");
         cell.scene = None;
         let mut again = Command::new(env!("CARGO_BIN_EXE_graspd"))
@@ -143,7 +143,7 @@ fn shared_memory_deleted_overwritten_or_cut_under_a_moving_arm() {
             .unwrap();
         std::thread::sleep(Duration::from_secs(2));
         if again.alive() {
-            assert!(matches!(ask_to_stop(&names), Heard::Socket { .. }), "{kind}");
+            assert!(matches!(request_stop(&names), StopAnswer::Socket { .. }), "{kind}");
             again.signal(Signal::TERM);
         }
         ended(&mut again, Duration::from_secs(10));
@@ -155,7 +155,7 @@ fn shared_memory_deleted_overwritten_or_cut_under_a_moving_arm() {
     }
 }
 
-/// What somebody with an account on this machine can try.
+/// What a user with an account on this machine can try.
 const ATTEMPTS: &str = r#"
 cd /; G=$1; R=$2; P=$3
 for f in /dev/shm/*; do
@@ -172,8 +172,8 @@ echo DONE
 "#;
 
 #[test]
-fn another_local_user_can_take_nothing_away() {
-    if !in_a_namespace_of_its_own("another_local_user_can_take_nothing_away") {
+fn another_local_user_cannot_affect_the_daemon() {
+    if !in_own_namespace("another_local_user_cannot_affect_the_daemon") {
         return;
     }
     let mut cell = Cell::new(42);
@@ -189,8 +189,8 @@ fn another_local_user_can_take_nothing_away() {
     let attack = |script: &str| {
         Command::new("sh")
             .args(["-c", script, "sh", env!("CARGO_BIN_EXE_graspd"), names.root().to_str().unwrap(), &pid])
-            .uid(STRANGER)
-            .gid(STRANGER)
+            .uid(ATTACKER)
+            .gid(ATTACKER)
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
@@ -198,25 +198,25 @@ fn another_local_user_can_take_nothing_away() {
             .unwrap()
     };
     let out = attack(ATTEMPTS).wait_with_output().unwrap();
-    let said = String::from_utf8_lossy(&out.stdout);
-    println!("the stranger got: {said}");
-    assert_eq!(said.trim(), "DONE", "a stranger reached something");
-    assert!(daemon.alive(), "the stranger killed the daemon:\n{}", cell.world.log());
+    let reached = String::from_utf8_lossy(&out.stdout);
+    println!("output of the attack: {reached}");
+    assert_eq!(reached.trim(), "DONE", "the attacker reached something");
+    assert!(daemon.alive(), "the attacker killed the daemon:\n{}", cell.world.log());
     let cause = cell.world.log();
     assert!(!cause.contains("damaged"), "{cause}");
-    // His programs on every processor, and shared memory filled by him while the arm moves: every stop is obeyed.
+    // The attacker's programs on every processor, and shared memory filled while the arm moves: every stop is executed.
     let mut busy: Vec<_> = (0..4).map(|_| attack("while :; do :; done")).collect();
-    let (mut obeyed, mut tries) = (0, 0);
-    while obeyed < 2 {
+    let (mut stopped, mut tries) = (0, 0);
+    while stopped < 2 {
         tries += 1;
-        assert!(tries < 9, "eight times no motion to stop\n{}", cell.world.log());
+        assert!(tries < 9, "no motion to stop in eight attempts\n{}", cell.world.log());
         cell.drive(Duration::from_millis(200));
         attack("dd if=/dev/zero of=/dev/shm/fill bs=1M").wait().unwrap();
         let free = Command::new("df").args(["--output=avail", "/dev/shm"]).output().unwrap();
         let free = String::from_utf8_lossy(&free.stdout).lines().last().and_then(|l| l.trim().parse::<u64>().ok());
         assert!(free.is_some_and(|kb| kb < 1024), "not full: {free:?} kB");
         let asked = now_ns();
-        if obeyed == 0 {
+        if stopped == 0 {
             by_socket(&names)
         } else {
             daemon.signal(Signal::USR1)
@@ -225,12 +225,12 @@ fn another_local_user_can_take_nothing_away() {
         std::fs::remove_file("/dev/shm/fill").unwrap();
         match stops::judge(&cell.wire.read(), asked) {
             Ok(stop) => {
-                stop.check(["a stranger's load, full, socket", "a stranger's load, full, SIGUSR1"][obeyed]);
-                obeyed += 1;
+                stop.check(["attacker's load, full, socket", "attacker's load, full, SIGUSR1"][stopped]);
+                stopped += 1;
             }
             Err(e) => {
                 assert!(!e.starts_with(char::is_uppercase), "{e}");
-                println!("passed over: {e}");
+                println!("skipped: {e}");
             }
         }
     }
@@ -241,7 +241,7 @@ fn another_local_user_can_take_nothing_away() {
     assert!(daemon.alive(), "{}", cell.world.log());
     daemon.signal(Signal::TERM);
     assert_eq!(ended(&mut daemon, Duration::from_secs(4)), Some(0));
-    // Names that he took before us, and a link where our folder is looked for, are refused by name.
+    // A symbolic link in place of the daemon's folder is refused.
     std::fs::remove_dir_all(names.root()).unwrap();
     std::os::unix::fs::symlink("/tmp", names.root()).unwrap();
     let (accepted, _) = cell.world.verb(&["status"]);

@@ -1,4 +1,4 @@
-//! Dashboard client: one line out, one line back.
+//! Dashboard client: each command is one line, each answer is one line.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use super::ur_config::{ArmError, Port, UrConfig};
 
-/// The longest line that is read; the controller's are far shorter.
-const MAX_LINE: u64 = 4096;
+/// Maximum length of a line, bytes; the controller's lines are much shorter.
+const MAX_LINE_BYTES: u64 = 4096;
 
 /// A connection to the dashboard server (port 29999; PolyScope 3 and 5).
 #[derive(Debug)]
@@ -25,17 +25,17 @@ impl Dashboard {
         Ok(dashboard)
     }
 
-    /// Sends a command and gives its answer without the line's end.
+    /// Sends a command and returns its answer without the line end.
     pub fn ask(&mut self, command: &str) -> Result<String, ArmError> {
         let line = format!("{command}\n");
         self.stream.get_mut().write_all(line.as_bytes()).map_err(|e| io(e, self.timeout))?;
         self.line()
     }
 
-    /// Sends a command whose answer must start with one of these words, in any case.
+    /// Sends a command whose answer must start with one of `success`, ignoring case.
     ///
     /// # Errors
-    /// Anything else, with `fix`.
+    /// Any other answer, with `fix`.
     pub fn demand(&mut self, command: &str, success: &[&str], fix: &'static str) -> Result<String, ArmError> {
         let answer = self.ask(command)?;
         let lower = answer.to_ascii_lowercase();
@@ -46,21 +46,21 @@ impl Dashboard {
         }
     }
 
-    /// Asks again and again until the answer contains `wanted`.
+    /// Repeats a command every 0.1 s until the answer contains `expected`.
     ///
     /// # Errors
-    /// The last answer with `fix` when it is not there in time.
+    /// The last answer, with `fix`, when `limit` has passed.
     pub fn wait_for(
         &mut self,
         command: &'static str,
-        wanted: &str,
+        expected: &str,
         limit: Duration,
         fix: &'static str,
     ) -> Result<String, ArmError> {
         let start = Instant::now();
         loop {
             let answer = self.ask(command)?;
-            if answer.to_ascii_uppercase().contains(wanted) {
+            if answer.to_ascii_uppercase().contains(expected) {
                 return Ok(answer);
             }
             if start.elapsed() >= limit {
@@ -70,18 +70,18 @@ impl Dashboard {
         }
     }
 
-    /// One line, bounded in length and in time however slowly it drips.
+    /// Reads one line, bounded in length and in total time, also when single bytes arrive slowly.
     fn line(&mut self) -> Result<String, ArmError> {
         let deadline = Instant::now() + self.timeout;
         let mut line = Vec::new();
         while !line.ends_with(b"\n") {
             let left = deadline.saturating_duration_since(Instant::now());
-            if left.is_zero() || line.len() as u64 >= MAX_LINE {
+            if left.is_zero() || line.len() as u64 >= MAX_LINE_BYTES {
                 return Err(ArmError::Timeout { what: "dashboard answer", seconds: self.timeout.as_secs_f64() });
             }
             let fail = |e| io(e, self.timeout);
             self.stream.get_ref().set_read_timeout(Some(left)).map_err(fail)?;
-            // `fill_buf` reads once; `read_until` alone would go on as long as bytes drip in.
+            // `fill_buf` reads once; `read_until` alone would not return while bytes keep arriving.
             let available = self.stream.fill_buf().map_err(fail)?;
             if available.is_empty() {
                 return Err(fail(std::io::ErrorKind::UnexpectedEof.into()));

@@ -5,21 +5,21 @@ use std::fmt;
 use graspd_rt::arm::{ArmCommand, RobotState};
 use graspd_rt::rtde::{ClientError, ClockStep, FrameError};
 
-/// Why a link is of no use any more. Latched: a link that failed once never moves an arm again; a new one is made on an
-/// ordinary thread, and it starts unarmed.
+/// Why a link has failed. Latched: a failed link never moves an arm again. A new link is made on an ordinary thread and
+/// starts unarmed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum LinkFault {
     /// The controller closed the connection.
     Closed,
-    /// The operating system reports this error number on the socket.
+    /// Error number of the operating system on the socket.
     Io(i32),
     /// The byte stream is not RTDE.
     Framing(FrameError),
-    /// A package that this session cannot have.
+    /// A package that the session does not allow.
     Protocol(ClientError),
-    /// The controller's clock went back: it restarted.
+    /// The controller's clock went back: the controller restarted.
     ClockBack,
-    /// The controller does not take our packages: the send buffer was full for this long, ns.
+    /// The controller does not read our packages: the send buffer was full for this long, ns.
     SendBlocked(u64),
 }
 
@@ -40,48 +40,50 @@ impl fmt::Display for LinkFault {
 
 impl std::error::Error for LinkFault {}
 
-/// What came from the arm since the last poll.
+/// What arrived from the arm since the last poll.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct LinkPoll {
-    /// The newest state, if any came.
+    /// The newest state, if one arrived.
     pub state: Option<RobotState>,
-    /// How many packages came; all but the newest are superseded.
+    /// Number of packages that arrived; the newest supersedes the others.
     pub packages: u32,
-    /// How many the controller left out in between, by its own clock.
+    /// Number of packages that the controller left out in between, by its clock.
     pub missing: u32,
-    /// How its clock stepped to the newest one.
+    /// The step of its clock to the newest package.
     pub clock: Option<ClockStep>,
-    /// Why the link has ended. A state that came before the end is still given.
+    /// Why the link has ended. A state that arrived before is still returned.
     pub fault: Option<LinkFault>,
 }
 
-/// Counters of a link since it was made.
+/// Counters of a link since its start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LinkStats {
     /// State packages received.
     pub received: u64,
     /// State packages that the controller left out.
     pub missing: u64,
-    /// Commands sent whole.
+    /// Commands sent completely.
     pub sent: u64,
     /// Commands dropped because the send buffer was full.
     pub dropped: u64,
 }
 
-/// An arm, as the command thread sees it.
+/// A link to an arm, as the command thread uses it.
 ///
-/// Every method returns at once, allocates nothing and takes no lock. Time is CLOCK_MONOTONIC in nanoseconds, given by the caller.
+/// No method except [`ArmLink::wait`] blocks, and none allocates or takes a lock. Time is CLOCK_MONOTONIC in
+/// nanoseconds, given by the caller.
 pub trait ArmLink: Send {
-    /// Takes everything that has come.
+    /// Receives everything that has arrived.
     fn poll(&mut self, now_ns: u64) -> LinkPoll;
 
-    /// Sends one command. A full send buffer drops and counts it; only after 20 ms of that it is a fault.
+    /// Sends one command. With a full send buffer the command is dropped and counted; after 20 ms of that the link
+    /// fails.
     fn send(&mut self, command: &ArmCommand) -> Result<(), LinkFault>;
 
     /// The session token that the control script must echo in [`RobotState::script_token`].
     fn token(&self) -> i32;
 
-    /// State packages a second that the link asked for.
+    /// Requested rate of state packages, Hz.
     fn rate_hz(&self) -> f64;
 
     /// Counters.
@@ -90,7 +92,8 @@ pub trait ArmLink: Send {
     /// Why it has ended, if it has.
     fn fault(&self) -> Option<LinkFault>;
 
-    /// Waits for the robot's next package, at most until `deadline_ns`; true when something came. With this the robot is the
-    /// clock: wait for its package, compute, write, and the write lands in its next step. The one call that sleeps.
+    /// Waits for the robot's next package until `deadline_ns` at the latest; true when data arrived. With the robot as
+    /// the clock, a cycle waits for the package, computes and sends, and the command takes effect in the robot's next
+    /// step. The only call that sleeps.
     fn wait(&mut self, deadline_ns: u64) -> bool;
 }

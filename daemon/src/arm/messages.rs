@@ -1,37 +1,39 @@
-//! What the controller says on its primary interface: why it stopped, what stands on the pendant, why a program failed.
+//! Robot messages of the primary interface: why the controller stopped, what the pendant shows, why a program failed.
 //!
-//! Robot messages (package type 20) are `u64 time, i8 source, u8 kind` and a body by kind. Unknown kinds are passed over.
+//! A robot message (package type 20) is `u64 time, i8 source, u8 kind` and a body that depends on the kind. Unknown
+//! kinds are skipped.
 
 use std::io::{self, Read};
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
 use super::primary::header;
+use super::status::safety_mode_text;
 use super::ur_config::{ArmError, Port, UrConfig};
 
 /// Package type of a robot message.
 const ROBOT_MESSAGE: u8 = 20;
-/// Characters of a message that are kept.
-const LONGEST: usize = 300;
-/// Bytes of one call; the rest waits for the next.
-const MOST_BYTES: usize = 1 << 18;
+/// Maximum length of a message, characters; the rest is cut off.
+const MAX_MESSAGE_CHARS: usize = 300;
+/// Maximum number of bytes read in one call; the rest is read in the next.
+const MAX_POLL_BYTES: usize = 1 << 18;
 /// Pause between attempts to connect.
-const RETRY: Duration = Duration::from_secs(3);
-/// How long an attempt may take: the caller has other things to do.
-const PATIENCE: Duration = Duration::from_millis(300);
+const RETRY_DELAY: Duration = Duration::from_secs(3);
+/// Maximum time of an attempt to connect; the caller's thread waits for it.
+const CONNECT_TIMEOUT: Duration = Duration::from_millis(300);
 
-/// One message, in words.
+/// One robot message.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Said {
-    /// What kind of message it is.
-    pub kind: SaidKind,
+pub struct RobotMessage {
+    /// Its kind.
+    pub kind: MessageKind,
     /// Its text, on one line.
     pub text: String,
 }
 
-/// Kinds of message that an operator has to know of.
+/// Kinds of message that matter to an operator.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum SaidKind {
+pub enum MessageKind {
     /// The safety mode changed.
     Safety,
     /// A coded error.
@@ -42,42 +44,42 @@ pub enum SaidKind {
     Program,
 }
 
-/// Reads the body of a robot message, behind the five bytes of its header; `None` for kinds that matter to no operator, and for
-/// bodies that are too short.
-pub fn parse_message(body: &[u8]) -> Option<Said> {
+/// Reads the body of a robot message, without the five bytes of its header; `None` for a kind that does not matter to
+/// an operator and for a body that is too short.
+pub fn parse_message(body: &[u8]) -> Option<RobotMessage> {
     let (&kind, body) = body.get(9..)?.split_first()?;
-    let word = |at: usize| body.get(at..)?.first_chunk::<4>().map(|b| i32::from_be_bytes(*b));
-    let said = |kind, text: String| Some(Said { kind, text: one_line(text) });
+    let int = |at: usize| body.get(at..)?.first_chunk::<4>().map(|b| i32::from_be_bytes(*b));
+    let message = |kind, text: String| Some(RobotMessage { kind, text: one_line(text) });
     match kind {
         // Request id, request type, three flags, title.
         2 => {
             let length = usize::from(*body.get(8)?);
             let (title, text) = (body.get(9..9 + length)?, body.get(9 + length..)?);
-            said(SaidKind::Popup, format!("{}: {}", lossy(title), lossy(text)))
+            message(MessageKind::Popup, format!("{}: {}", lossy(title), lossy(text)))
         }
         5 => {
-            let (code, argument, mode) = (word(0)?, word(4)?, *body.get(8)?);
+            let (code, argument, mode) = (int(0)?, int(4)?, *body.get(8)?);
             let code = if code == 0 { String::new() } else { format!(" (C{code}A{argument})") };
-            said(SaidKind::Safety, format!("{}{code}", safety_mode(i32::from(mode))))
+            message(MessageKind::Safety, format!("{}{code}", safety_mode_text(i32::from(mode))))
         }
         // Code, argument, level, data type, data, text. Levels below 2 are information.
         6 => {
-            let (code, argument, level) = (word(0)?, word(4)?, word(8)?);
+            let (code, argument, level) = (int(0)?, int(4)?, int(8)?);
             if level < 2 {
                 return None;
             }
-            said(SaidKind::Error, format!("C{code}A{argument} {}", lossy(body.get(20..)?)))
+            message(MessageKind::Error, format!("C{code}A{argument} {}", lossy(body.get(20..)?)))
         }
         // Code, argument, title, text.
         7 => {
-            let (code, argument, length) = (word(0)?, word(4)?, usize::from(*body.get(8)?));
+            let (code, argument, length) = (int(0)?, int(4)?, usize::from(*body.get(8)?));
             let (title, text) = (body.get(9..9 + length)?, body.get(9 + length..)?);
-            said(SaidKind::Error, format!("C{code}A{argument} {}: {}", lossy(title), lossy(text)))
+            message(MessageKind::Error, format!("C{code}A{argument} {}: {}", lossy(title), lossy(text)))
         }
         10 => {
-            let (line, column) = (word(0)?, word(4)?);
+            let (line, column) = (int(0)?, int(4)?);
             let place = if line > 0 { format!("line {line}, column {column}: ") } else { String::new() };
-            said(SaidKind::Program, format!("{place}{}", lossy(body.get(8..)?)))
+            message(MessageKind::Program, format!("{place}{}", lossy(body.get(8..)?)))
         }
         _ => None,
     }
@@ -87,92 +89,40 @@ fn lossy(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }
 
-/// Whatever a controller sends, a log line stays a line.
+/// Control characters become spaces, so that a message is one line of the log.
 fn one_line(text: String) -> String {
-    let clean: String = text.chars().map(|c| if c.is_control() { ' ' } else { c }).take(LONGEST).collect();
+    let clean: String = text.chars().map(|c| if c.is_control() { ' ' } else { c }).take(MAX_MESSAGE_CHARS).collect();
     clean.trim().to_owned()
 }
 
-/// A safety mode in words.
-pub fn safety_mode(mode: i32) -> &'static str {
-    match mode {
-        1 => "normal",
-        2 => "reduced",
-        3 => "protective stop",
-        4 => "recovery mode: a joint is outside its limits",
-        5 | 12 | 18 | 19 => "safeguard stop",
-        6 | 15 | 20 => "emergency stop (system input)",
-        7 => "emergency stop (button)",
-        8 => "safety violation",
-        9 => "fault of the safety system",
-        10 => "validating joint identity",
-        13 | 14 => "three-position enabling switch released",
-        _ => "unknown safety mode",
-    }
-}
-
-/// What `safety_status_bits` say, the gravest first.
-pub fn safety_words(bits: u32) -> &'static str {
-    let known = [
-        (9, "fault of the safety system"),
-        (8, "safety violation"),
-        (7, "emergency stop"),
-        (6, "emergency stop (button)"),
-        (5, "emergency stop (system input)"),
-        (4, "safeguard stop"),
-        (3, "recovery mode"),
-        (2, "protective stop"),
-        (10, "stopped for safety"),
-        (1, "reduced"),
-        (0, "normal"),
-    ];
-    known.into_iter().find(|(bit, _)| bits >> bit & 1 == 1).map_or("unknown", |(_, words)| words)
-}
-
-/// A robot mode in words.
-pub fn robot_mode(mode: i32) -> &'static str {
-    match mode {
-        -1 => "no controller",
-        0 => "disconnected",
-        1 => "waits for the safety configuration to be confirmed",
-        2 => "booting",
-        3 => "power off",
-        4 => "powering on",
-        5 => "idle, brakes on",
-        6 => "backdrive",
-        7 => "running",
-        8 => "updating firmware",
-        _ => "unknown",
-    }
-}
-
-/// Listens to the primary interface beside the RTDE session, on an ordinary thread that looks in now and then.
+/// Reads robot messages from the primary interface, in parallel to the RTDE session; polled by an ordinary thread.
 #[derive(Debug)]
-pub struct Ear {
+pub struct MessageListener {
     config: UrConfig,
     stream: Option<TcpStream>,
     bytes: Vec<u8>,
     next_try: Instant,
 }
 
-impl Ear {
-    /// An ear that has not connected yet.
-    pub fn new(config: &UrConfig) -> Ear {
-        let config = UrConfig { timeout: PATIENCE.min(config.timeout), ..config.clone() };
-        Ear { config, stream: None, bytes: Vec::new(), next_try: Instant::now() }
+impl MessageListener {
+    /// A listener without a connection; the first poll connects.
+    pub fn new(config: &UrConfig) -> MessageListener {
+        let config = UrConfig { timeout: CONNECT_TIMEOUT.min(config.timeout), ..config.clone() };
+        MessageListener { config, stream: None, bytes: Vec::new(), next_try: Instant::now() }
     }
 
-    /// Everything worth knowing that was said since the last call. Returns at once, but for an attempt to connect now and then.
-    pub fn listen(&mut self) -> Vec<Said> {
-        let mut said = Vec::new();
-        if self.take(&mut said).is_err() {
-            (self.stream, self.next_try) = (None, Instant::now() + RETRY);
+    /// The messages that arrived since the last call. Does not wait, except up to 0.3 s for an attempt to connect every
+    /// 3 s.
+    pub fn poll(&mut self) -> Vec<RobotMessage> {
+        let mut messages = Vec::new();
+        if self.receive(&mut messages).is_err() {
+            (self.stream, self.next_try) = (None, Instant::now() + RETRY_DELAY);
             self.bytes = Vec::new();
         }
-        said
+        messages
     }
 
-    fn take(&mut self, said: &mut Vec<Said>) -> Result<(), ArmError> {
+    fn receive(&mut self, messages: &mut Vec<RobotMessage>) -> Result<(), ArmError> {
         let fail = |source| ArmError::Io { service: Port::Primary, source };
         if self.stream.is_none() {
             if Instant::now() < self.next_try {
@@ -185,7 +135,7 @@ impl Ear {
         let Some(stream) = self.stream.as_mut() else { return Ok(()) };
         let mut chunk = [0u8; 8192];
         let mut got = 0;
-        while got < MOST_BYTES {
+        while got < MAX_POLL_BYTES {
             match stream.read(&mut chunk) {
                 Ok(0) => return Err(fail(io::ErrorKind::UnexpectedEof.into())),
                 Ok(n) => {
@@ -203,7 +153,7 @@ impl Ear {
                 };
                 let Some(body) = rest.get(5..size) else { break };
                 if kind == ROBOT_MESSAGE {
-                    said.extend(parse_message(body));
+                    messages.extend(parse_message(body));
                 }
                 used += size;
             }
@@ -223,13 +173,13 @@ mod tests {
     }
 
     #[test]
-    fn what_stopped_the_arm_is_told_with_its_code() {
+    fn the_cause_of_a_stop_is_reported_with_its_code() {
         let body = [&153i32.to_be_bytes()[..], &2i32.to_be_bytes(), &[3], &[0; 8]].concat();
-        let said = parse_message(&message(5, &body)).unwrap();
-        assert_eq!(said, Said { kind: SaidKind::Safety, text: "protective stop (C153A2)".to_owned() });
+        let got = parse_message(&message(5, &body)).unwrap();
+        assert_eq!(got, RobotMessage { kind: MessageKind::Safety, text: "protective stop (C153A2)".to_owned() });
         let words = [157i32, 1, 3, 0, 0].map(i32::to_be_bytes).concat();
-        let said = parse_message(&message(6, &[&words[..], b"joint 1 near\nits limit"].concat())).unwrap();
-        assert_eq!(said.text, "C157A1 joint 1 near its limit");
+        let got = parse_message(&message(6, &[&words[..], b"joint 1 near\nits limit"].concat())).unwrap();
+        assert_eq!(got.text, "C157A1 joint 1 near its limit");
         let popup = [&[0, 0, 0, 0, 0, 1, 0, 0, 5][..], b"TitleText"].concat();
         assert_eq!(parse_message(&message(2, &popup)).unwrap().text, "Title: Text");
         let runtime = [&[0, 0, 0, 7, 0, 0, 0, 3][..], b"name is not defined"].concat();
@@ -238,21 +188,12 @@ mod tests {
         assert_eq!(parse_message(&message(6, &info)), None);
     }
 
-    #[test]
-    fn the_gravest_safety_bit_is_named() {
-        assert_eq!(safety_words(0b1), "normal");
-        assert_eq!(safety_words(0b10), "reduced");
-        assert_eq!(safety_words(0b100), "protective stop");
-        assert_eq!(safety_words(1 << 10 | 1 << 7 | 1 << 6), "emergency stop");
-        assert_eq!(safety_words(0), "unknown");
-    }
-
     proptest! {
         #[test]
-        fn no_bytes_make_it_panic(body in proptest::collection::vec(any::<u8>(), 0..120), kind in 0u8..12) {
+        fn arbitrary_bytes_do_not_panic(body in proptest::collection::vec(any::<u8>(), 0..120), kind in 0u8..12) {
             parse_message(&body);
-            if let Some(said) = parse_message(&message(kind, &body)) {
-                prop_assert!(said.text.chars().count() <= LONGEST && !said.text.contains('\n'));
+            if let Some(got) = parse_message(&message(kind, &body)) {
+                prop_assert!(got.text.chars().count() <= MAX_MESSAGE_CHARS && !got.text.contains('\n'));
             }
         }
     }

@@ -1,11 +1,11 @@
-//! A mock arm in the process: no sockets, no thread, and the clock is the caller's.
+//! An arm simulated in the process, without sockets or threads, on the caller's clock.
 
-use graspd_rt::arm::{ArmCommand, ArmMode, Joints, Model, RobotState};
+use graspd_rt::arm::{ArmCommand, ArmMode, Joints, Model, ROBOT_MODE_RUNNING, RobotState};
 use graspd_rt::rtde::{ClockStep, script_state};
 
 use super::link::{ArmLink, LinkFault, LinkPoll, LinkStats};
 
-/// What the mock arm can do.
+/// Dynamics of the simulated arm.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MockLimits {
     /// Speed that the script refuses to exceed, rad/s.
@@ -14,14 +14,14 @@ pub struct MockLimits {
     pub acceleration: f64,
     /// Time constant of the drives, s.
     pub lag_s: f64,
-    /// A heartbeat that stops for this long ramps the arm down, s.
+    /// The arm ramps down when the heartbeat has not changed for this long, s.
     pub patience_s: f64,
     /// Controller step, s.
     pub step_s: f64,
 }
 
 impl MockLimits {
-    /// Those of a model under our script.
+    /// Those of a model under the control script.
     pub fn of(model: Model) -> MockLimits {
         let step_s = if model.is_e_series() { 0.002 } else { 0.008 };
         MockLimits {
@@ -34,12 +34,13 @@ impl MockLimits {
     }
 }
 
-/// Steps of one poll; a longer pause of the caller's clock is a pause of the arm's.
+/// Maximum number of steps in one poll; in a longer pause of the caller's clock the arm's clock pauses as well.
 const MAX_STEPS: u32 = 500;
 
-/// The mock arm: joint rates with acceleration limit and lag, the control script's states and faults, no kinematics.
+/// A link to the simulated arm: joint rates with acceleration limit and lag, states and faults of the control script,
+/// no kinematics.
 #[derive(Clone, Debug, PartialEq)]
-pub struct MockArm {
+pub struct MockLink {
     limits: MockLimits,
     q: Joints,
     qd: Joints,
@@ -47,7 +48,7 @@ pub struct MockArm {
     target_qd: Joints,
     command: ArmCommand,
     script: (i32, i32),
-    still_s: f64,
+    heartbeat_still_s: f64,
     last_heartbeat: i32,
     safety: u32,
     mode: i32,
@@ -59,10 +60,10 @@ pub struct MockArm {
     stats: LinkStats,
 }
 
-impl MockArm {
+impl MockLink {
     /// At rest at `q`, rad.
-    pub fn new(q: Joints, limits: MockLimits) -> MockArm {
-        MockArm {
+    pub fn new(q: Joints, limits: MockLimits) -> MockLink {
+        MockLink {
             limits,
             q,
             qd: [0.0; 6],
@@ -70,10 +71,10 @@ impl MockArm {
             target_qd: [0.0; 6],
             command: ArmCommand::default(),
             script: (script_state::IDLE, 0),
-            still_s: 0.0,
+            heartbeat_still_s: 0.0,
             last_heartbeat: 0,
             safety: 1,
-            mode: 7,
+            mode: ROBOT_MODE_RUNNING,
             outputs: 0,
             clock_s: 100.0,
             stepped_ns: None,
@@ -83,12 +84,12 @@ impl MockArm {
         }
     }
 
-    /// Sets `safety_status_bits` (bit 0 normal): anything but normal or reduced brakes the arm.
+    /// Sets `safety_status_bits`: any bit other than normal (0) and reduced (1) stops the arm.
     pub fn set_safety(&mut self, bits: u32) {
         self.safety = bits;
     }
 
-    /// Sets `robot_mode`: anything but 7 brakes the arm.
+    /// Sets `robot_mode`: any mode other than running stops the arm.
     pub fn set_mode(&mut self, mode: i32) {
         self.mode = mode;
     }
@@ -114,7 +115,7 @@ impl MockArm {
             runtime_state: if running { 2 } else { 1 },
             speed_scaling: 1.0,
             target_speed_fraction: 1.0,
-            // The tool's outputs stand where a controller has them, behind the configurable ones.
+            // As in a controller, the tool's outputs follow the configurable ones.
             digital_outputs: self.outputs & 0xff | (self.outputs & 0x300) << 8,
             tool: None,
             echo: self.last_heartbeat,
@@ -125,21 +126,21 @@ impl MockArm {
     }
 
     fn can_move(&self) -> bool {
-        self.mode == 7 && self.safety & !0b11 == 0
+        self.mode == ROBOT_MODE_RUNNING && self.safety & !0b11 == 0
     }
 
-    /// One step of the control script: the rates it asks for.
+    /// One step of the control script; returns the rates that it commands.
     fn script_step(&mut self) -> Joints {
         let zero = [0.0; 6];
         let c = self.command;
         if c.heartbeat == self.last_heartbeat {
-            self.still_s += self.limits.step_s;
+            self.heartbeat_still_s += self.limits.step_s;
         } else {
-            self.still_s = 0.0;
+            self.heartbeat_still_s = 0.0;
             self.last_heartbeat = c.heartbeat;
         }
         let refused = c.rates.iter().zip(self.limits.speed).any(|(r, max)| !(r.abs() <= max));
-        self.script = if self.still_s >= self.limits.patience_s
+        self.script = if self.heartbeat_still_s >= self.limits.patience_s
             && (c.mode != ArmMode::Idle || self.script.0 == script_state::FAULT)
         {
             (script_state::FAULT, 4)
@@ -160,16 +161,16 @@ impl MockArm {
 
     /// One controller step of dynamics.
     fn step(&mut self) {
-        let wanted = if self.can_move() { self.script_step() } else { [0.0; 6] };
+        let commanded = if self.can_move() { self.script_step() } else { [0.0; 6] };
         let dt = self.limits.step_s;
         // `speedj`: the leading axis accelerates at the limit, the others reach their speeds with it.
-        let far = wanted.iter().zip(self.target_qd).fold(0.0f64, |m, (w, v)| m.max((w - v).abs()));
-        let share = if far > 0.0 { (self.limits.acceleration * dt / far).min(1.0) } else { 0.0 };
+        let max_change = commanded.iter().zip(self.target_qd).fold(0.0f64, |m, (c, v)| m.max((c - v).abs()));
+        let fraction = if max_change > 0.0 { (self.limits.acceleration * dt / max_change).min(1.0) } else { 0.0 };
         let follow = 1.0 - (-dt / self.limits.lag_s.max(1e-6)).exp();
-        let targets = self.target_q.iter_mut().zip(&mut self.target_qd).zip(wanted);
+        let targets = self.target_q.iter_mut().zip(&mut self.target_qd).zip(commanded);
         let actual = self.q.iter_mut().zip(&mut self.qd);
-        for (((target_q, target_qd), wanted), (q, qd)) in targets.zip(actual) {
-            *target_qd += share * (wanted - *target_qd);
+        for (((target_q, target_qd), commanded), (q, qd)) in targets.zip(actual) {
+            *target_qd += fraction * (commanded - *target_qd);
             *target_q += *target_qd * dt;
             let moved = follow * (*target_q - *q);
             *q += moved;
@@ -179,7 +180,7 @@ impl MockArm {
     }
 }
 
-impl ArmLink for MockArm {
+impl ArmLink for MockLink {
     fn poll(&mut self, now_ns: u64) -> LinkPoll {
         if self.cut.is_some() {
             return LinkPoll { fault: self.cut, ..LinkPoll::default() };
@@ -227,7 +228,7 @@ impl ArmLink for MockArm {
         self.cut
     }
 
-    /// Nothing to wait for: the next package is made by the next poll.
+    /// Returns immediately: the next poll makes the next package.
     fn wait(&mut self, _deadline_ns: u64) -> bool {
         false
     }
@@ -239,11 +240,11 @@ mod tests {
 
     const MS2: u64 = 2_000_000;
 
-    fn arm() -> MockArm {
-        MockArm::new(graspd_rt::arm::READY, MockLimits::of(Model::Ur5e))
+    fn arm() -> MockLink {
+        MockLink::new(graspd_rt::arm::READY, MockLimits::of(Model::Ur5e))
     }
 
-    fn drive(arm: &mut MockArm, now: &mut u64, mode: ArmMode, rate: f64, heartbeats: i32) -> RobotState {
+    fn drive(arm: &mut MockLink, now: &mut u64, mode: ArmMode, rate: f64, heartbeats: i32) -> RobotState {
         for heartbeat in 1..=heartbeats {
             arm.send(&ArmCommand { mode, rates: [rate; 6], heartbeat: heartbeat + *now as i32, outputs: 0 }).unwrap();
             *now += MS2;
@@ -262,14 +263,14 @@ mod tests {
             assert!((s.target_qd[0] - last).abs() <= 10.0 * 0.002 + 1e-12);
             last = s.target_qd[0];
         }
-        // 0.4 s at 0.5 rad/s, less the ramp's half (0.0125 rad); then stop, and the lag is caught up.
+        // 0.4 s at 0.5 rad/s, minus half the ramp (0.0125 rad); after the stop the lag has decayed.
         let s = drive(&mut arm, &mut now, ArmMode::Stop, 0.0, 200);
         assert!((s.q[0] - start[0] - 0.2).abs() < 2e-3, "{}", s.q[0] - start[0]);
         assert!(s.qd[0].abs() < 1e-6 && s.script_state == script_state::STOPPING);
     }
 
     #[test]
-    fn a_heartbeat_that_stops_stops_it_until_idle() {
+    fn a_heartbeat_that_stops_is_a_fault_until_idle() {
         let (mut arm, mut now) = (arm(), MS2);
         drive(&mut arm, &mut now, ArmMode::Velocity, 0.5, 100);
         for _ in 0..100 {
@@ -287,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn nan_over_limit_and_safety_stops_do_not_move_it() {
+    fn nan_rates_above_the_limit_and_safety_stops_do_not_move_it() {
         for (rate, bits) in [(f64::NAN, 1), (4.0, 1), (0.5, 0b100)] {
             let (mut arm, mut now) = (arm(), MS2);
             arm.set_safety(bits);

@@ -1,7 +1,7 @@
-//! Reader of the primary interface: who the arm is, and its calibrated kinematics.
+//! Reader of the primary interface: the arm's type and its calibrated kinematics.
 //!
-//! Framing: `i32 size` (this field included), `u8 type`. A robot-state package (16) is a row of sub-packages framed alike;
-//! unknown ones and unread tails are skipped.
+//! Framing: `i32 size` (including this field), `u8 type`. A robot-state package (16) is a sequence of sub-packages with
+//! the same framing; unknown sub-packages and unread tails are skipped.
 
 use std::io::Read;
 use std::time::{Duration, Instant};
@@ -16,26 +16,27 @@ const ROBOT_STATE: u8 = 16;
 const KINEMATICS: u8 = 5;
 /// Sub-package with limits and the robot's type.
 const CONFIGURATION: u8 = 6;
-/// Larger packages than this are not sent by any controller.
-const MAX_PACKAGE: usize = 1 << 16;
-/// An arm as built is this close to its model's table at the flange, m. Models differ by more.
-pub const SAME_ARM: f64 = 0.03;
+/// Maximum size of a package, bytes; no controller sends larger ones.
+const MAX_PACKAGE_BYTES: usize = 1 << 16;
+/// Maximum distance between the flange positions of an arm's calibrated table and its model's, m. Different models are
+/// farther apart.
+pub const MAX_FLANGE_DISTANCE_M: f64 = 0.03;
 
-/// What the controller says about the arm.
+/// The arm that the controller reports.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Identity {
     /// Robot type number: 1 UR5, 2 UR10, 3 UR3, 4 UR16, 7 UR20, 8 UR30.
     pub robot_type: i32,
-    /// The unit's own table.
+    /// Its calibrated Denavit-Hartenberg table.
     pub dh: Dh,
 }
 
-/// The sub-packages of a robot-state package's body. Ends where a size cannot be right.
+/// Iterator over the sub-packages in the body of a robot-state package. It ends at an invalid size.
 #[derive(Clone, Debug)]
 pub struct SubPackages<'a>(&'a [u8]);
 
 impl<'a> SubPackages<'a> {
-    /// Over the body of a package of type 16, behind its header of five bytes.
+    /// Over the body of a package of type 16, without its header of five bytes.
     pub fn new(body: &'a [u8]) -> SubPackages<'a> {
         SubPackages(body)
     }
@@ -53,14 +54,14 @@ impl<'a> Iterator for SubPackages<'a> {
     }
 }
 
-/// Type and whole size of what starts here; `None` when there are too few bytes or the size is impossible.
+/// Type and size, header included, of the package that starts here; `None` with too few bytes or an invalid size.
 pub(super) fn header(bytes: &[u8]) -> Option<(u8, usize)> {
     let &[a, b, c, d, kind] = bytes.first_chunk::<5>()?;
     let size = usize::try_from(i32::from_be_bytes([a, b, c, d])).ok()?;
-    if (5..=MAX_PACKAGE).contains(&size) { Some((kind, size)) } else { None }
+    if (5..=MAX_PACKAGE_BYTES).contains(&size) { Some((kind, size)) } else { None }
 }
 
-/// Six doubles from byte `at`.
+/// Six finite doubles from byte `at`.
 fn doubles(bytes: &[u8], at: usize) -> Option<[f64; 6]> {
     let raw = bytes.get(at..)?.first_chunk::<48>()?;
     let (chunks, _) = raw.as_chunks::<8>();
@@ -71,11 +72,12 @@ fn doubles(bytes: &[u8], at: usize) -> Option<[f64; 6]> {
     out.iter().all(|v| v.is_finite()).then_some(out)
 }
 
-/// Reads what a robot-state body says about the arm into what is known so far: type, table.
+/// Reads robot type and kinematics from a robot-state body into `known`; what the body does not contain is left as it
+/// is.
 pub fn parse_identity(body: &[u8], known: &mut (Option<i32>, Option<Dh>)) {
     for (kind, body) in SubPackages::new(body) {
         match kind {
-            // Checksums of six joints, then theta, a, d, alpha, then a status word. The table is nominal plus calibration.
+            // Checksums of six joints, then theta, a, d, alpha (nominal plus calibration), then a status word.
             KINEMATICS => {
                 let column = |i: usize| doubles(body, 24 + 48 * i);
                 if let (Some(theta), Some(a), Some(d), Some(alpha)) = (column(0), column(1), column(2), column(3)) {
@@ -94,7 +96,10 @@ pub fn parse_identity(body: &[u8], known: &mut (Option<i32>, Option<Dh>)) {
     }
 }
 
-/// Asks the primary interface who the arm is. The two sub-packages come about once a second.
+/// Reads the arm's type and kinematics from the primary interface, which sends them about once a second.
+///
+/// # Errors
+/// No connection, or no such package within the timeout.
 pub fn read_identity(config: &UrConfig) -> Result<Identity, ArmError> {
     let mut stream = config.open(Port::Primary)?;
     let fail = |source| ArmError::Io { service: Port::Primary, source };
@@ -114,7 +119,10 @@ pub fn read_identity(config: &UrConfig) -> Result<Identity, ArmError> {
         }
         while bytes.len() >= 5 {
             let Some((kind, size)) = header(&bytes) else {
-                return Err(fail(std::io::Error::new(std::io::ErrorKind::InvalidData, "a package of impossible size")));
+                return Err(fail(std::io::Error::new(
+                    std::io::ErrorKind::InvalidData,
+                    "a package with an invalid size",
+                )));
             };
             if bytes.len() < size {
                 break;
@@ -131,7 +139,10 @@ pub fn read_identity(config: &UrConfig) -> Result<Identity, ArmError> {
     Err(timeout)
 }
 
-/// Refuses an arm that is not the configured model: by type number, and by where its table puts the flange.
+/// Refuses an arm that is not the configured model, by its type number and by the flange positions of its table.
+///
+/// # Errors
+/// [`ArmError::WrongModel`].
 pub fn check_model(identity: &Identity, model: Model) -> Result<(), ArmError> {
     let (number, family) = match model {
         Model::Ur5 | Model::Ur5e => (1, "UR5"),
@@ -145,31 +156,35 @@ pub fn check_model(identity: &Identity, model: Model) -> Result<(), ArmError> {
     if identity.robot_type != number {
         return Err(wrong(format!("robot type {} ({family} is {number})", identity.robot_type)));
     }
-    let apart = flanges_apart(&Dh::nominal(model), &identity.dh);
+    let distance_m = flange_distance(&Dh::nominal(model), &identity.dh);
     // Written so that NaN is refused.
-    if !(apart < SAME_ARM) {
-        return Err(wrong(format!("kinematics {:.0} mm away from that model's", apart * 1e3)));
+    if !(distance_m < MAX_FLANGE_DISTANCE_M) {
+        return Err(wrong(format!("kinematics {:.0} mm away from that model's", distance_m * 1e3)));
     }
     Ok(())
 }
 
-/// Refuses kinematics that are not those of the arm at hand: what the controller says of itself is the measure.
+/// Refuses kinematics that differ from those that the controller reports.
+///
+/// # Errors
+/// [`ArmError::OtherKinematics`].
 pub fn check_kinematics(identity: &Identity, dh: &Dh) -> Result<(), ArmError> {
-    let apart = flanges_apart(&identity.dh, dh);
-    if !(apart < SAME_ARM) {
-        return Err(ArmError::OtherKinematics { apart_mm: apart * 1e3 });
+    let distance_m = flange_distance(&identity.dh, dh);
+    if !(distance_m < MAX_FLANGE_DISTANCE_M) {
+        return Err(ArmError::OtherKinematics { distance_mm: distance_m * 1e3 });
     }
     Ok(())
 }
 
-/// How far apart two tables put the flange, at worst, m. Calibrated tables differ in single numbers by metres (parallel
-/// axes) and in the flange by millimetres, so that only the flange tells.
-pub fn flanges_apart(a: &Dh, b: &Dh) -> f64 {
-    let places = [[0.0; 6], [0.5, -1.2, 1.0, -0.7, 1.3, 0.2], [-1.0, -0.4, -1.5, 0.9, -1.1, 2.0]];
-    places.iter().fold(0.0, |worst: f64, q| {
+/// Maximum distance between the flange positions of two tables over three configurations, m. Single parameters of
+/// calibrated tables differ by metres (parallel axes) and flange positions by millimetres, so that only the flange can
+/// be compared.
+pub fn flange_distance(a: &Dh, b: &Dh) -> f64 {
+    let configurations = [[0.0; 6], [0.5, -1.2, 1.0, -0.7, 1.3, 0.2], [-1.0, -0.4, -1.5, 0.9, -1.1, 2.0]];
+    configurations.iter().fold(0.0, |max: f64, q| {
         let flange = |dh: &Dh| dh.base_from_flange(q).translation.vector;
-        let apart = (flange(a) - flange(b)).norm();
-        if apart.is_nan() { f64::INFINITY } else { worst.max(apart) }
+        let distance = (flange(a) - flange(b)).norm();
+        if distance.is_nan() { f64::INFINITY } else { max.max(distance) }
     })
 }
 
@@ -199,10 +214,10 @@ mod tests {
     }
 
     #[test]
-    fn a_units_own_table_is_read_and_its_model_known() {
+    fn a_calibrated_table_is_read_and_matches_its_model_only() {
         let mut dh = Dh::nominal(Model::Ur5e);
         dh.a[1] += 0.002;
-        // Calibrated units have large opposite offsets here.
+        // Calibrated arms have large opposite offsets here.
         dh.d[1] += 30.0;
         dh.d[2] -= 30.0;
         let mut known = (None, None);
@@ -217,7 +232,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_bytes_make_it_panic(body in proptest::collection::vec(any::<u8>(), 0..600), cut in 0usize..1200) {
+        fn arbitrary_bytes_do_not_panic(body in proptest::collection::vec(any::<u8>(), 0..600), cut in 0usize..1200) {
             let mut known = (None, None);
             parse_identity(&body, &mut known);
             let mut real = state(&Dh::nominal(Model::Ur3), 3);
@@ -226,8 +241,7 @@ mod tests {
         }
     }
 
-    /// A file's table against the controller's, on both sides of what one arm may differ by, and with a number that is
-    /// none.
+    /// A file's table against the controller's, on both sides of the limit and with NaN.
     #[test]
     fn kinematics_of_another_arm_are_refused() {
         let dh = Dh::nominal(Model::Ur5e);
@@ -238,8 +252,8 @@ mod tests {
             check_kinematics(&identity, &other)
         };
         assert!(longer(0.0).is_ok() && longer(0.029).is_ok());
-        let said = longer(0.031).unwrap_err().to_string();
-        assert!(said.contains("31 mm") && said.contains("arm.kinematics"), "{said}");
+        let message = longer(0.031).unwrap_err().to_string();
+        assert!(message.contains("31 mm") && message.contains("arm.kinematics"), "{message}");
         assert!(longer(f64::NAN).is_err());
     }
 }

@@ -1,4 +1,4 @@
-//! `graspd recover`: from a protective stop, or from power off, back to an idle arm under our script.
+//! `graspd recover`: from a protective stop or power off back to an idle arm under the control script.
 
 use std::time::{Duration, Instant};
 
@@ -6,21 +6,21 @@ use super::dashboard::Dashboard;
 use super::script::start_script;
 use super::ur_config::{ArmError, UrConfig};
 
-/// One step of the chain, told as it is done.
+/// One completed step of a recovery.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RecoverStep {
-    /// What was asked of the controller.
+    /// The command sent to the controller.
     pub command: &'static str,
-    /// What it answered.
+    /// Its answer.
     pub answer: String,
 }
 
-/// How long the chain waits for what takes its time.
+/// Timeouts of the slow steps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RecoverTimes {
-    /// Powering on, and releasing the brakes.
+    /// Powering on and releasing the brakes, each.
     pub power_up: Duration,
-    /// Unlocking: refused for five seconds after the stop.
+    /// Unlocking: the controller refuses it for five seconds after the stop.
     pub unlock: Duration,
 }
 
@@ -30,36 +30,40 @@ impl Default for RecoverTimes {
     }
 }
 
-/// Walks the dashboard and uploads the control script with `token`: [`walk_out`], then [`start_script`] at the controller's own
-/// step. The arm ends idle: the script waits for the handshake, and nothing is armed.
+/// Recovers the controller and uploads the control script with `token`: [`walk_out`], then [`start_script`] for the
+/// controller's step. The arm ends idle: the script waits for the handshake, and nothing is armed.
 ///
 /// # Errors
-/// The first step that the controller refuses, with what to do about it.
-pub fn recover(config: &UrConfig, token: i32, mut tell: impl FnMut(&RecoverStep)) -> Result<(), ArmError> {
-    let step_s = walk_out(config, RecoverTimes::default(), &mut tell)?;
+/// The first step that the controller refuses, with what to do.
+pub fn recover(config: &UrConfig, token: i32, mut report: impl FnMut(&RecoverStep)) -> Result<(), ArmError> {
+    let step_s = walk_out(config, RecoverTimes::default(), &mut report)?;
     start_script(config, token, step_s)?;
-    tell(&RecoverStep { command: "upload", answer: "control script uploaded".to_owned() });
+    report(&RecoverStep { command: "upload", answer: "control script uploaded".to_owned() });
     Ok(())
 }
 
-/// Walks the dashboard from wherever the robot stands to running: close popups, unlock a protective stop, power on, release the
-/// brakes, stop a program that still runs. Returns the controller's step, s.
+/// Brings the robot to mode running through the dashboard: close popups, unlock a protective stop, power on, release
+/// the brakes, stop a program that still runs. Returns the controller's step, s.
 ///
-/// Called only when an operator asks for it. It never touches an emergency stop, a safeguard or a safety fault: those are ended at
-/// the robot, and are reported.
+/// Called only on an operator's request. Emergency stops, safeguards and safety faults are reported, never cleared:
+/// they have to be cleared at the robot.
 ///
 /// # Errors
-/// The first step that the controller refuses, with what to do about it.
-pub fn walk_out(config: &UrConfig, times: RecoverTimes, tell: &mut impl FnMut(&RecoverStep)) -> Result<f64, ArmError> {
+/// The first step that the controller refuses, with what to do.
+pub fn walk_out(
+    config: &UrConfig,
+    times: RecoverTimes,
+    report: &mut impl FnMut(&RecoverStep),
+) -> Result<f64, ArmError> {
     let mut dashboard = Dashboard::open(config)?;
-    let mut done = |command, answer| tell(&RecoverStep { command, answer });
+    let mut done = |command, answer| report(&RecoverStep { command, answer });
     let step_s = controller_step(config, &mut dashboard)?;
-    // In local control an e-Series answers questions and refuses the rest. CB3 does not know the question.
+    // In local control an e-Series answers queries and refuses commands. CB3 does not know this query.
     if dashboard.ask("is in remote control")?.trim().eq_ignore_ascii_case("false") {
         return Err(ArmError::LocalControl);
     }
     for command in ["close safety popup", "close popup"] {
-        // Nothing to close is no failure.
+        // The answer does not matter: there may be no popup.
         let answer = dashboard.ask(command)?;
         done(command, answer);
     }
@@ -68,20 +72,21 @@ pub fn walk_out(config: &UrConfig, times: RecoverTimes, tell: &mut impl FnMut(&R
     match safety_of(&safety) {
         Safety::Good => {}
         Safety::ProtectiveStop => unlock(&mut dashboard, times.unlock, &mut done)?,
-        Safety::AtTheRobot(fix) => {
+        Safety::ClearAtRobot(fix) => {
             return Err(ArmError::Dashboard { command: "safetymode".to_owned(), answer: safety, fix });
         }
     }
     power_up(&mut dashboard, times.power_up, &mut done)?;
-    // Whatever still runs (a script of a session that died, somebody's program) stands in our script's way; a stop is what was asked for.
+    // A running program (the script of a lost session, or another one) blocks the control script; the operator asked
+    // for a recovery.
     if dashboard.ask("running")?.to_ascii_lowercase().contains("true") {
         done("stop", dashboard.demand("stop", &["Stopped"], "stop the program on the pendant")?);
     }
     Ok(step_s)
 }
 
-/// The controller's step by its software: PolyScope 3 is CB3, 125 Hz; everything later 500 Hz. Where it does not say, by the
-/// configured model.
+/// The controller's step, s, from its software version: 125 Hz with PolyScope 3 (CB3), 500 Hz with later versions.
+/// Without a version in the answer, from the configured model.
 fn controller_step(config: &UrConfig, dashboard: &mut Dashboard) -> Result<f64, ArmError> {
     let answer = dashboard.ask("PolyscopeVersion")?;
     let major = answer.split(|c: char| !c.is_ascii_digit()).find_map(|n| n.parse::<u32>().ok());
@@ -92,38 +97,38 @@ fn controller_step(config: &UrConfig, dashboard: &mut Dashboard) -> Result<f64, 
 enum Safety {
     Good,
     ProtectiveStop,
-    /// Only a person at the robot may end this.
-    AtTheRobot(&'static str),
+    /// A person has to clear this at the robot.
+    ClearAtRobot(&'static str),
 }
 
 fn safety_of(answer: &str) -> Safety {
-    let word = answer.to_ascii_uppercase();
-    let has = |w: &str| word.contains(w);
+    let upper = answer.to_ascii_uppercase();
+    let has = |text: &str| upper.contains(text);
     if has("PROTECTIVE_STOP") {
         Safety::ProtectiveStop
     } else if has("EMERGENCY") {
-        Safety::AtTheRobot("release the emergency stop at the robot, then run `graspd recover` again")
+        Safety::ClearAtRobot("release the emergency stop at the robot, then run `graspd recover` again")
     } else if has("SAFEGUARD") {
-        Safety::AtTheRobot("close the safeguard and confirm it at the robot, then run `graspd recover` again")
+        Safety::ClearAtRobot("close the safeguard and confirm it at the robot, then run `graspd recover` again")
     } else if has("VIOLATION") || has("FAULT") {
-        Safety::AtTheRobot("restart the safety system on the pendant after looking for the cause in its log")
+        Safety::ClearAtRobot("find the cause in the pendant's log, then restart the safety system there")
     } else if has("RECOVERY") {
-        Safety::AtTheRobot("a joint stands outside its limits; move the arm back by hand on the pendant")
+        Safety::ClearAtRobot("a joint is outside its limits; move the arm back by hand on the pendant")
     } else if has("NORMAL") || has("REDUCED") {
         Safety::Good
     } else {
-        Safety::AtTheRobot("graspd does not know this safety mode; end it on the pendant")
+        Safety::ClearAtRobot("graspd does not know this safety mode; clear it on the pendant")
     }
 }
 
-/// From any robot mode that leads there to RUNNING.
+/// Brings the robot to RUNNING from any mode that allows it.
 fn power_up(
     dashboard: &mut Dashboard,
     limit: Duration,
     done: &mut impl FnMut(&'static str, String),
 ) -> Result<(), ArmError> {
     let mode = dashboard.ask("robotmode")?;
-    let has = |w: &str| mode.to_ascii_uppercase().contains(w);
+    let has = |text: &str| mode.to_ascii_uppercase().contains(text);
     if has("RUNNING") {
         return Ok(());
     }
@@ -141,29 +146,29 @@ fn power_up(
         if !has("POWER_ON") && !has("BOOTING") {
             done(
                 "power on",
-                dashboard.demand("power on", &["Powering on"], "look at the pendant for what holds the power back")?,
+                dashboard.demand("power on", &["Powering on"], "the pendant shows why the power stays off")?,
             );
         }
-        // A short model's arm passes IDLE and waits there for its brakes.
-        dashboard.wait_for("robotmode", "IDLE", limit, "the arm did not get power in time; look at the pendant")?;
+        // The arm stays in IDLE until its brakes are released.
+        dashboard.wait_for("robotmode", "IDLE", limit, "the arm has no power after the timeout; see the pendant")?;
     }
     let answer =
-        dashboard.demand("brake release", &["Brake releasing"], "look at the pendant for what holds the brakes")?;
+        dashboard.demand("brake release", &["Brake releasing"], "the pendant shows why the brakes stay closed")?;
     done("brake release", answer);
-    let fix = "the brakes did not open in time; look at the pendant";
+    let fix = "the brakes did not open within the timeout; see the pendant";
     let answer = dashboard.wait_for("robotmode", "RUNNING", limit, fix)?;
     done("robotmode", answer);
     Ok(())
 }
 
-/// Asks for the unlock until the controller's waiting time has passed.
+/// Repeats the unlock until the controller's waiting time has passed, then waits for the safety mode to become normal.
 fn unlock(
     dashboard: &mut Dashboard,
     limit: Duration,
     done: &mut impl FnMut(&'static str, String),
 ) -> Result<(), ArmError> {
     const COMMAND: &str = "unlock protective stop";
-    const FIX: &str = "the stop's cause may still be there: look at `graspd status` and at the pendant";
+    const FIX: &str = "the cause of the stop may still be present: see `graspd status` and the pendant";
     let start = Instant::now();
     loop {
         match dashboard.demand(COMMAND, &["Protective stop releasing"], FIX) {
@@ -189,7 +194,7 @@ fn unlock(
             Safety::ProtectiveStop => {
                 return Err(ArmError::Dashboard { command: COMMAND.to_owned(), answer, fix: FIX });
             }
-            Safety::AtTheRobot(fix) => {
+            Safety::ClearAtRobot(fix) => {
                 return Err(ArmError::Dashboard { command: "safetymode".to_owned(), answer, fix });
             }
         }

@@ -1,4 +1,4 @@
-//! What must be known to talk to a UR controller, and what can go wrong.
+//! How a UR controller is reached and used, and the errors of doing so.
 
 use std::io;
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
@@ -21,13 +21,13 @@ pub enum Port {
     Rtde = 30004,
 }
 
-/// How motion is asked for.
+/// How motion is commanded.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Motion {
     /// `speedj`.
     #[default]
     Velocity,
-    /// `servoj`, by integrating the rates; adds about its lookahead (30 ms and more) as delay.
+    /// `servoj` to the integrated rates; delays the motion by about its lookahead time (30 ms or more).
     Position,
 }
 
@@ -40,13 +40,13 @@ pub struct UrConfig {
     pub port_offset: u16,
     /// The model that the configuration states.
     pub model: Model,
-    /// State packages a second; the controller's maximum when `None`.
+    /// Rate of state packages, Hz; the controller's maximum when `None`.
     pub frequency_hz: Option<f64>,
-    /// Cycle of the command thread, Hz: the script's patience follows from it.
+    /// Rate of the command thread, Hz; the script's heartbeat timeout follows from it.
     pub cycle_hz: f64,
-    /// How motion is asked for.
+    /// How motion is commanded.
     pub motion: Motion,
-    /// Speed that the script refuses to exceed, each joint, rad/s.
+    /// Maximum speed of each joint that the script accepts, rad/s.
     pub speed_limits: Joints,
     /// Acceleration of `speedj`, rad/s2.
     pub acceleration: f64,
@@ -54,12 +54,12 @@ pub struct UrConfig {
     pub stop_acceleration: f64,
     /// The controller stops the program when no command came for this long, ms.
     pub watchdog_ms: f64,
-    /// How long connecting and each answer may take.
+    /// Timeout of connecting and of each answer.
     pub timeout: Duration,
 }
 
 impl UrConfig {
-    /// Usual values for a model at an address: 500 Hz cycle, the model's speeds, 50 ms watchdog.
+    /// Default values for a model at an address: 500 Hz cycle, the model's joint speeds, 50 ms watchdog.
     pub fn new(address: impl Into<String>, model: Model) -> UrConfig {
         UrConfig {
             address: address.into(),
@@ -76,7 +76,7 @@ impl UrConfig {
         }
     }
 
-    /// Opens a TCP connection to a service, within the timeout.
+    /// Opens a TCP connection to a service within the timeout.
     pub(super) fn open(&self, port: Port) -> Result<TcpStream, ArmError> {
         let number = (port as u16).wrapping_add(self.port_offset);
         let fail = |source| ArmError::Connect { address: self.address.clone(), port: number, source };
@@ -98,7 +98,7 @@ impl UrConfig {
     }
 }
 
-/// What goes wrong between the daemon and a controller, outside the real-time path.
+/// Errors between the daemon and a controller, outside the real-time path.
 #[derive(Debug, thiserror::Error)]
 pub enum ArmError {
     /// No connection.
@@ -108,15 +108,15 @@ pub enum ArmError {
         address: String,
         /// Port number.
         port: u16,
-        /// What the system says.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// A connection ended or failed while in use.
+    /// A connection was closed or failed while in use.
     #[error("{service:?} connection failed: {source}")]
     Io {
         /// The service.
         service: Port,
-        /// What the system says.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// No answer in time.
@@ -124,7 +124,7 @@ pub enum ArmError {
     Timeout {
         /// What was waited for.
         what: &'static str,
-        /// How long.
+        /// The timeout, s.
         seconds: f64,
     },
     /// The session could not be set up.
@@ -139,12 +139,13 @@ pub enum ArmError {
     /// Another program runs on the robot.
     #[error("another program runs on the robot; stop it on the pendant, or run `graspd recover`")]
     ProgramRunning,
-    /// Scripts are taken in remote control only.
-    #[error("the robot is in local control and takes no script; switch it to Remote Control on the pendant")]
+    /// The controller accepts scripts in remote control only.
+    #[error("the robot is in local control and accepts no script; switch it to Remote Control on the pendant")]
     LocalControl,
     /// The robot cannot run a program now.
     #[error(
-        "the robot is not ready: robot_mode {mode} (7 is running), safety_status_bits {safety:#x}; run `graspd recover`"
+        "the robot is not ready: robot_mode {mode} ({running} is running), safety_status_bits {safety:#x}; run `graspd recover`",
+        running = graspd_rt::arm::ROBOT_MODE_RUNNING
     )]
     NotReady {
         /// `robot_mode`.
@@ -152,62 +153,65 @@ pub enum ArmError {
         /// `safety_status_bits`.
         safety: u32,
     },
-    /// The uploaded script does not answer.
+    /// The uploaded script does not start.
     #[error("the control script did not start within {seconds:.1} s: {hint}")]
     NoScript {
-        /// How long was waited.
+        /// The timeout, s.
         seconds: f64,
-        /// What the controller said, or what to look at.
+        /// Where to find the cause.
         hint: String,
     },
     /// The robot runs another version of the script.
-    #[error("the control script answers as version {found}, this daemon speaks {expected}")]
+    #[error(
+        "the control script reports version {found}, this daemon needs {expected}: stop the program on the pendant and connect again"
+    )]
     ScriptVersion {
-        /// What the script says.
+        /// Version that the script reports.
         found: i32,
-        /// What is needed.
+        /// Version that the daemon needs.
         expected: i32,
     },
-    /// It is another kind of arm.
-    #[error("the configuration says {expected}, but the controller reports {found}; set arm.model")]
+    /// The arm is another model.
+    #[error("arm.model is {expected}, but the controller reports {found}; set arm.model")]
     WrongModel {
         /// From the configuration.
         expected: &'static str,
         /// From the controller.
         found: String,
     },
-    /// The kinematics given are not this arm's.
+    /// The configured kinematics are another arm's.
     #[error(
-        "arm.kinematics puts the flange {apart_mm:.0} mm away from where the controller says it is: name this arm's own file, or \
-         use \"controller\""
+        "arm.kinematics puts the flange {distance_mm:.0} mm away from where the controller reports it: use the file of this arm, or \
+         \"controller\""
     )]
     OtherKinematics {
-        /// How far apart, mm.
-        apart_mm: f64,
+        /// Distance of the flange positions, mm.
+        distance_mm: f64,
     },
     /// A dashboard command was refused.
     #[error("dashboard answers `{command}` with \"{answer}\": {fix}")]
     Dashboard {
-        /// What was asked.
+        /// The command.
         command: String,
-        /// What was answered.
+        /// The answer.
         answer: String,
         /// What to do.
         fix: &'static str,
     },
-    /// A setting cannot be.
+    /// A setting is out of range.
     #[error("{key} = {value}: {fix}")]
     Setting {
         /// The setting.
         key: &'static str,
         /// Its value.
         value: f64,
-        /// What it must be.
+        /// What to set it to.
         fix: &'static str,
     },
 }
 
-/// A session token that no earlier session had, as far as a clock can tell: never 0, which is what unused registers hold.
+/// A session token that differs from those of earlier sessions, made from the time and the process id. Never 0, the
+/// value of unused registers.
 pub fn fresh_token() -> i32 {
     let nanos = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_nanos() as u64);
     let mixed = (nanos ^ u64::from(std::process::id()).rotate_left(40)).wrapping_mul(0x9e37_79b9_7f4a_7c15);

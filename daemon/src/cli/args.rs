@@ -1,9 +1,9 @@
-//! What can be typed.
+//! The command line.
 
 use clap::{Args, Parser, Subcommand};
 use std::path::PathBuf;
 
-/// Guides a robot gripper onto a curved part, with two fixed cameras and no knowledge of where they stand.
+/// Guides a robot gripper onto a curved part with two fixed cameras whose pose relative to the robot is unknown.
 #[derive(Debug, Parser)]
 #[command(name = "graspd", version, propagate_version = true, max_term_width = 110)]
 #[command(
@@ -11,7 +11,7 @@ use std::path::PathBuf;
     Try it without a robot: graspd demo"
 )]
 pub struct Cli {
-    /// What to do.
+    /// The subcommand.
     #[command(subcommand)]
     pub command: Command,
 }
@@ -21,43 +21,43 @@ pub struct Cli {
 pub enum Command {
     /// Run the whole chain against a simulated robot and simulated cameras, as separate processes
     Demo(DemoArgs),
-    /// Off line: from one click in each image, or a CAD mesh, to a set-point (plan.toml) and an overlay
+    /// Off-line stage: from one click in each image, or a CAD mesh, to a set-point (plan.toml) and an overlay
     Plan(Box<PlanArgs>),
-    /// On line: the real-time daemon; frames in, robot commands out
+    /// On-line stage: the real-time daemon; frames in, robot commands out
     Run(RunArgs),
-    /// What the daemon is doing
+    /// Show the state of the daemon
     Status(ClientArgs),
-    /// Allow motion to be started; moves nothing
+    /// Allow motion to be started; the arm does not move
     Arm(ClientArgs),
     /// Start servoing to the set-point
     Servo(ClientArgs),
     /// Ramp down to rest. Not a safety function: the emergency stop is the robot's own button
     Stop(ClientArgs),
-    /// Clear a latched fault once its cause is gone; moves nothing
+    /// Clear a latched fault once its cause is removed; the arm does not move
     Reset(ClientArgs),
-    /// Walk the controller out of a protective stop (close popup, unlock, power, brakes, script); ends idle
+    /// Recover the controller from a protective stop (close popup, unlock, power, brakes, script); ends idle
     Recover(ClientArgs),
-    /// Close or open the gripper by its outputs; at rest or on the grasp only
+    /// Close or open the gripper by its outputs; only at rest or on the grasp
     Gripper(GripperArgs),
-    /// Offer a plan to the daemon as its set-point
+    /// Send a plan to the daemon as its set-point
     Setpoint(SetpointArgs),
     /// Reconstruct circles and ellipses from edge points in two views (JSON in, JSON out)
     Reconstruct(ReconstructArgs),
     /// Monte Carlo study of the off-line stage: errors against the Cramer-Rao bound
     Study(StudyArgs),
-    /// Check a configuration and every file it names, and touch nothing
+    /// Check a configuration and every file it names; changes nothing
     Check(RunArgs),
-    /// The mock UR controller (also a program of its own: graspd-mock-ur)
+    /// The mock UR controller (also a separate program: graspd-mock-ur)
     #[cfg(feature = "demo")]
     #[command(hide = true, disable_help_flag = true)]
     MockUr(PassThrough),
-    /// The stereo scene simulator (also a program of its own: graspd-scene)
+    /// The stereo scene simulator (also a separate program: graspd-scene)
     #[cfg(feature = "demo")]
     #[command(hide = true, disable_help_flag = true)]
     Scene(PassThrough),
 }
 
-/// Arguments handed on unread.
+/// Arguments that are passed on.
 #[derive(Debug, Args)]
 pub struct PassThrough {
     /// Arguments of the program.
@@ -76,19 +76,19 @@ pub struct RunArgs {
 /// Verbs sent to a running daemon.
 #[derive(Debug, Args)]
 pub struct ClientArgs {
-    /// The daemon's configuration file: tells which cell and which shared-memory root
+    /// The daemon's configuration file: gives cell and shared-memory root
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// Cell name, where no configuration file is given
+    /// Cell name, without a configuration file
     #[arg(long, default_value = "cell")]
     pub cell: String,
-    /// Shared-memory root folder, where no configuration file is given
+    /// Shared-memory root folder, without a configuration file
     #[arg(long, value_name = "DIR")]
     pub shm_root: Option<PathBuf>,
-    /// One JSON object instead of words
+    /// Print one JSON object instead of text
     #[arg(long)]
     pub json: bool,
-    /// How long to wait for the daemon, seconds
+    /// Timeout of the daemon's answer, seconds
     #[arg(long, default_value_t = 2.0)]
     pub timeout: f64,
 }
@@ -96,9 +96,9 @@ pub struct ClientArgs {
 /// `graspd gripper`.
 #[derive(Debug, Args)]
 pub struct GripperArgs {
-    /// Which way
-    #[arg(value_parser = ["close", "open"])]
-    pub way: String,
+    /// Motion of the fingers
+    #[arg(value_name = "MOTION", value_parser = ["close", "open"])]
+    pub motion: String,
     #[command(flatten)]
     #[allow(missing_docs)]
     pub client: ClientArgs,
@@ -107,7 +107,7 @@ pub struct GripperArgs {
 /// `graspd setpoint`.
 #[derive(Debug, Args)]
 pub struct SetpointArgs {
-    /// The plan to offer
+    /// The plan to send
     #[arg(value_name = "PLAN.toml")]
     pub plan: PathBuf,
     #[command(flatten)]
@@ -135,7 +135,7 @@ pub struct StudyArgs {
     /// Seed of the study
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Only the cells whose name holds this text
+    /// Only the cells whose name contains this text
     #[arg(long, value_name = "TEXT")]
     pub cell: Option<String>,
 }
@@ -170,7 +170,7 @@ pub struct PlanArgs {
     /// Rim model: auto, edge, circle, ellipse, round-bar
     #[arg(long, default_value = "auto")]
     pub rim: String,
-    /// Bar diameter in metres, where the operator knows it (round-bar rims)
+    /// Bar diameter in metres, if known (round-bar rims)
     #[arg(long, value_name = "M")]
     pub bar_diameter: Option<f64>,
     /// Distance of the pre-grasp pose from the object's plane, metres [default: 0.12, for a mesh 0.08 before the grasp]
@@ -179,70 +179,71 @@ pub struct PlanArgs {
     /// Distance of the grasp pose from the object's plane, metres
     #[arg(long, value_name = "M", default_value_t = 0.0, allow_hyphen_values = true)]
     pub standoff: f64,
-    /// Uncertainty of the place that the task tolerates (one sigma), millimetres [default: 2, for a mesh 3]
+    /// Maximum standard deviation of the position, millimetres [default: 2, for a mesh 3]
     #[arg(long, value_name = "MM")]
     pub tolerance_mm: Option<f64>,
-    /// Uncertainty of the axis that the task tolerates (one sigma), degrees [default: 1, for a mesh 2]
+    /// Maximum standard deviation of the axis, degrees [default: 1, for a mesh 2]
     #[arg(long, value_name = "DEG")]
     pub tolerance_deg: Option<f64>,
-    /// Where the gripper is now in the left camera's frame: a pose file, or X,Y,Z,RX,RY,RZ (metres, rotation vector in
-    /// radians). Checks the path's visibility, and decides angles that the marks leave open by the smallest turn
+    /// Present pose of the gripper in the left camera's frame: a pose file, or X,Y,Z,RX,RY,RZ (metres, rotation vector
+    /// in radians). The plan checks the visibility along the path, and chooses angles that the marks leave open by the
+    /// smallest turn
     #[arg(long, value_name = "POSE", allow_hyphen_values = true)]
     pub present: Option<String>,
-    /// Largest turn from the present pose, degrees
+    /// Maximum turn from the present pose, degrees
     #[arg(long, value_name = "DEG", requires = "present")]
     pub max_turn: Option<f64>,
-    /// Epipolar displacement that the rig file may have wrong, pixels (one sigma) [default: the rig file's stated quality]
+    /// Standard deviation of the epipolar error of the rig file, pixels [default: the rig file's stated quality]
     #[arg(long, value_name = "PX")]
     pub calibration_px: Option<f64>,
     /// Where to write the plan
     #[arg(long, value_name = "plan.toml")]
     pub out: Option<PathBuf>,
-    /// Where to draw both views with ellipse, normal and predicted gripper
+    /// Where to write a drawing of both views with ellipse, normal and predicted gripper
     #[arg(long, value_name = "plan.png")]
     pub overlay: Option<PathBuf>,
     /// Where to write a one-page report
     #[arg(long, value_name = "plan.html")]
     pub report: Option<PathBuf>,
-    /// One JSON object on standard output
+    /// Print one JSON object
     #[arg(long)]
     pub json: bool,
     #[command(flatten)]
     #[allow(missing_docs)]
-    pub part: super::mesh::MeshArgs,
+    pub part: super::mesh_args::MeshArgs,
 }
 
 /// `graspd demo`.
 #[derive(Debug, Clone, Args)]
 pub struct DemoArgs {
-    /// No progress, no images: run, print the result, end
+    /// Run without progress display and images, and print the result
     #[arg(long)]
     pub headless: bool,
-    /// Which world: valve, start, rig and noise are drawn from this number
+    /// Seed of the world: valve, start pose, rig and noise are drawn from it
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// One JSON object on standard output
+    /// Print one JSON object
     #[arg(long)]
     pub json: bool,
-    /// Where images, plan and recordings go
+    /// Folder for images, plan and recordings
     #[arg(long, value_name = "DIR", default_value = "graspd-demo")]
     pub out: PathBuf,
-    /// Views that close the loop; best is the paper's: the one view that shows the marks best
+    /// Views that close the loop; "best" is the paper's monocular mode: the one view that shows the marks best
     #[arg(long, default_value = "stereo", value_parser = ["stereo", "left", "right", "best"])]
     pub views: String,
-    /// Stereo pairs a second that the simulated cameras take
+    /// Frame rate of the simulated cameras, stereo pairs a second
     #[arg(long, value_name = "HZ", default_value_t = 60.0)]
     pub frame_rate: f64,
-    /// The arm's true kinematics differ from the model: MM,DEG on every link
+    /// Error of the arm's kinematic model: MM,DEG on every link
     #[arg(long, value_name = "MM,DEG")]
     pub kinematics_error: Option<String>,
-    /// The rig calibration given to both stages is wrong: FOCAL_PERCENT,DEG of relative rotation
+    /// Error of the rig calibration that both stages use: FOCAL_PERCENT,DEG of relative rotation
     #[arg(long, value_name = "PERCENT,DEG")]
     pub rig_error: Option<String>,
-    /// Stop at the pre-grasp pose instead of going on to the grasp
+    /// Stop at the pre-grasp pose instead of continuing to the grasp
     #[arg(long)]
     pub pregrasp_only: bool,
-    /// Give up after this many seconds
+    /// Timeout, seconds
     #[arg(long, default_value_t = 60.0)]
     pub timeout: f64,
 }

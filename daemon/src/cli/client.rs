@@ -1,16 +1,16 @@
-//! Verbs sent to a running daemon over shared memory.
+//! The subcommands that send a request to a running daemon.
 
 use super::args::{ClientArgs, SetpointArgs};
 use crate::config::Config;
 use crate::exit::{Exit, Failure};
 use crate::realtime::now_ns;
-use crate::stop::{Heard, ask as ask_to_stop};
+use crate::stop::{StopAnswer, ask as request_stop};
 use graspd_shm::control::{Answer, RequestClient, Verb};
 use graspd_shm::{Names, create_node};
 use serde_json::Value;
 use std::time::{Duration, Instant};
 
-/// Where the daemon of these arguments is to be found.
+/// Shared-memory names of the daemon that the arguments select.
 fn names(args: &ClientArgs) -> Result<Names, Failure> {
     match &args.config {
         Some(path) => Ok(Config::load(path)?.names),
@@ -18,7 +18,7 @@ fn names(args: &ClientArgs) -> Result<Names, Failure> {
     }
 }
 
-/// A way to the daemon.
+/// Connects to the daemon.
 fn connect(args: &ClientArgs) -> Result<RequestClient, Failure> {
     connect_to(&names(args)?, args)
 }
@@ -27,7 +27,7 @@ fn connect_to(names: &Names, args: &ClientArgs) -> Result<RequestClient, Failure
     if !(args.timeout.is_finite() && args.timeout > 0.0 && args.timeout <= 3600.0) {
         return Err(Failure {
             exit: Exit::Usage,
-            message: format!("--timeout {} is not a number of seconds from 0 to 3600", args.timeout),
+            message: format!("--timeout {}: give a number of seconds above 0, at most 3600", args.timeout),
         });
     }
     let node = create_node(names, "graspd-client").map_err(|e| Failure::link(e.to_string()))?;
@@ -38,44 +38,44 @@ fn ask(client: &RequestClient, args: &ClientArgs, verb: Verb, payload: &[u8]) ->
     client.ask(verb, payload, now_ns(), Duration::from_secs_f64(args.timeout)).map_err(|e| Failure::link(e.to_string()))
 }
 
-/// Sends a verb, prints the answer.
+/// Sends a verb and prints the answer.
 ///
 /// # Errors
 /// No daemon, a refused request, or a file that cannot be read.
 pub fn send(args: &ClientArgs, verb: Verb, payload: &[u8]) -> Result<Exit, Failure> {
     let answer = ask(&connect(args)?, args, verb, payload)?;
     show(args, &answer);
-    verdict(&answer)
+    exit_of(&answer)
 }
 
 fn show(args: &ClientArgs, answer: &Answer) {
     if args.json {
         println!("{}", answer.json);
     } else {
-        print_words(&answer.json);
+        print_table(&answer.json);
     }
 }
 
-/// `graspd stop`: by the stop socket, else by a signal; over shared memory only where both fail. Of the configuration it needs the cell
-/// and the shared-memory root alone: a file that has become unusable must not stand between an operator and a stop.
+/// `graspd stop`: by the stop socket, else by a signal; over shared memory only where both fail. It reads only the cell
+/// and the shared-memory root from the configuration: an invalid file must not prevent a stop.
 ///
 /// # Errors
-/// No daemon by any of the ways, or one whose command thread does not take the stop.
+/// No daemon was found, or its command thread does not take the stop.
 pub fn stop(args: &ClientArgs) -> Result<Exit, Failure> {
     let names = match &args.config {
         Some(path) => crate::config::names_of(path)?,
         None => crate::config::names(&args.cell, args.shm_root.as_deref())?,
     };
-    let (by, state) = match ask_to_stop(&names) {
-        Heard::Socket { taken: true, mode } => ("socket", mode),
-        Heard::Socket { taken: false, mode } => {
+    let (by, state) = match request_stop(&names) {
+        StopAnswer::Socket { taken: true, mode } => ("socket", mode),
+        StopAnswer::Socket { taken: false, mode } => {
             return Err(Failure::fault(format!(
-                "the daemon has the stop, and its command thread does not take it (last {mode}); the controller's watchdog stops the \
-                 arm; use the emergency stop if it moves"
+                "the daemon received the stop, but its command thread does not respond (last mode {mode}); the controller's watchdog \
+                 stops the arm; use the emergency stop if it moves"
             )));
         }
-        Heard::Signal { .. } => ("signal", "signalled".to_owned()),
-        Heard::Nobody(why) => {
+        StopAnswer::Signal { .. } => ("signal", "signalled".to_owned()),
+        StopAnswer::NoDaemon(why) => {
             return by_verb(&names, args).map_err(|e| Failure { message: format!("{e}\n{why}"), ..e });
         }
     };
@@ -88,16 +88,16 @@ pub fn stop(args: &ClientArgs) -> Result<Exit, Failure> {
 fn by_verb(names: &Names, args: &ClientArgs) -> Result<Exit, Failure> {
     let answer = ask(&connect_to(names, args)?, args, Verb::Stop, b"")?;
     show(args, &answer);
-    verdict(&answer)
+    exit_of(&answer)
 }
 
-/// How long a recovery may take: power, brakes, unlocking, and a new session.
-const RECOVERY: Duration = Duration::from_secs(90);
+/// Timeout of a recovery: power, brakes, unlocking and a new session.
+const RECOVERY_TIMEOUT: Duration = Duration::from_secs(90);
 
-/// `graspd recover`: asks for it, tells each step, and ends when the arm is idle under a new session, or with what stands in the way.
+/// `graspd recover`: requests a recovery, prints each step, and returns when the arm is idle in a new session.
 ///
 /// # Errors
-/// As [`send`], and what the controller refuses.
+/// As [`send`], and the step that the controller refuses.
 pub fn recover(args: &ClientArgs) -> Result<Exit, Failure> {
     let client = connect(args)?;
     let status = || -> Result<(Answer, Value), Failure> {
@@ -110,26 +110,26 @@ pub fn recover(args: &ClientArgs) -> Result<Exit, Failure> {
     let answer = ask(&client, args, Verb::Recover, b"")?;
     if !answer.accepted {
         show(args, &answer);
-        return verdict(&answer);
+        return exit_of(&answer);
     }
-    let (start, mut told) = (Instant::now(), 0);
+    let (start, mut printed) = (Instant::now(), 0);
     loop {
         std::thread::sleep(Duration::from_millis(100));
         let (answer, v) = status()?;
         let steps = v.pointer("/recovery/steps").and_then(Value::as_array).cloned().unwrap_or_default();
-        let begun = number(&v) > before;
+        let started = number(&v) > before;
         let running = v.pointer("/recovery/running").and_then(Value::as_bool).unwrap_or(false);
-        if begun && !args.json {
-            steps.iter().skip(told).filter_map(Value::as_str).for_each(|s| println!("{s}"));
-            told = steps.len();
+        if started && !args.json {
+            steps.iter().skip(printed).filter_map(Value::as_str).for_each(|s| println!("{s}"));
+            printed = steps.len();
         }
         let robot = v.get("robot").and_then(Value::as_str).unwrap_or_default();
         let error = v.pointer("/recovery/error").and_then(Value::as_str).map(str::to_owned);
-        // The first attempt at a session may come too early for the controller; a reason that stays is one.
-        let stays = start.elapsed() > Duration::from_secs(15);
-        let error = error.or_else(|| robot.strip_prefix("down: ").filter(|_| stays).map(str::to_owned));
-        let ended = begun && !running && (error.is_some() || robot == "up");
-        if ended || start.elapsed() > RECOVERY {
+        // The first connection may come too early for the controller: only an error that persists is reported.
+        let persists = start.elapsed() > Duration::from_secs(15);
+        let error = error.or_else(|| robot.strip_prefix("down: ").filter(|_| persists).map(str::to_owned));
+        let ended = started && !running && (error.is_some() || robot == "up");
+        if ended || start.elapsed() > RECOVERY_TIMEOUT {
             if args.json {
                 println!("{}", answer.json);
             }
@@ -137,13 +137,13 @@ pub fn recover(args: &ClientArgs) -> Result<Exit, Failure> {
                 Some(e) => Err(Failure::link(format!("not recovered: {e}"))),
                 None if !ended => Err(Failure::link(format!(
                     "not recovered within {} s; the robot link is: {robot}",
-                    RECOVERY.as_secs()
+                    RECOVERY_TIMEOUT.as_secs()
                 ))),
                 None => {
                     if !args.json {
                         let fault = v.get("state").and_then(Value::as_str) == Some("fault");
                         let next = if fault { "; `graspd reset` clears the fault" } else { "" };
-                        println!("the robot runs and the arm is idle{next}");
+                        println!("the robot is running and the arm is idle{next}");
                     }
                     Ok(Exit::Done)
                 }
@@ -153,7 +153,7 @@ pub fn recover(args: &ClientArgs) -> Result<Exit, Failure> {
 }
 
 /// The exit code of an answer.
-fn verdict(answer: &Answer) -> Result<Exit, Failure> {
+fn exit_of(answer: &Answer) -> Result<Exit, Failure> {
     if answer.accepted {
         return Ok(Exit::Done);
     }
@@ -180,16 +180,16 @@ pub fn setpoint(args: &SetpointArgs) -> Result<Exit, Failure> {
     send(&args.client, Verb::Setpoint, &text)
 }
 
-/// One line a key, nested objects indented.
-fn print_words(json: &str) {
+/// Prints one line for each key, with nested objects on the same line.
+fn print_table(json: &str) {
     match serde_json::from_str::<serde_json::Value>(json) {
         Ok(serde_json::Value::Object(map)) => {
             for (k, v) in map {
                 match v {
                     serde_json::Value::String(s) => println!("{k:>24}  {s}"),
                     serde_json::Value::Object(inner) => {
-                        let words: Vec<String> = inner.iter().map(|(a, b)| format!("{a} {b}")).collect();
-                        println!("{k:>24}  {}", words.join("  "));
+                        let pairs: Vec<String> = inner.iter().map(|(a, b)| format!("{a} {b}")).collect();
+                        println!("{k:>24}  {}", pairs.join("  "));
                     }
                     other => println!("{k:>24}  {other}"),
                 }

@@ -5,20 +5,21 @@ mod client;
 #[cfg(feature = "demo")]
 pub mod demo;
 mod mesh;
+mod mesh_args;
 mod plan;
 mod reconstruct;
 mod run;
+mod simulator;
 mod study;
-mod world;
 
 pub use args::{
     Cli, ClientArgs, Command, DemoArgs, GripperArgs, PassThrough, PlanArgs, ReconstructArgs, RunArgs, SetpointArgs,
     StudyArgs,
 };
 pub use client::{recover, send, setpoint, stop};
-pub use mesh::MeshArgs;
+pub use mesh_args::MeshArgs;
 pub use plan::plan;
 pub use reconstruct::reconstruct;
 pub use run::{check, run};
+pub use simulator::simulator;
 pub use study::study;
-pub use world::world;

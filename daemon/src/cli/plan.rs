@@ -1,4 +1,4 @@
-//! `graspd plan`: the off-line stage, on a contour in two images or on a CAD mesh.
+//! `graspd plan`: the off-line stage, for a contour in two images or for a CAD mesh.
 
 use super::args::PlanArgs;
 use crate::exit::{Exit, Failure};
@@ -8,12 +8,12 @@ use graspd_calib::files::keep_apart;
 use std::io::Write as _;
 use std::path::Path;
 
-/// Runs it.
+/// Makes a plan.
 ///
 /// # Errors
-/// Usage (2), a file or selection that is wrong (3), a rim or grasp that the tests refuse (1). Nothing is written then.
+/// Usage (2), a wrong file or selection (3), a rim or grasp that the tests refuse (1). Nothing is written then.
 pub fn plan(args: &PlanArgs) -> Result<Exit, Failure> {
-    keep_inputs(args).map_err(|message| Failure { exit: Exit::Usage, message })?;
+    check_outputs(args).map_err(|message| Failure { exit: Exit::Usage, message })?;
     if args.part.mesh.is_some() {
         return finish(args, super::mesh::plan(args));
     }
@@ -54,10 +54,10 @@ pub fn plan(args: &PlanArgs) -> Result<Exit, Failure> {
     finish(args, outcome)
 }
 
-/// No output over an input: a rig that was overwritten by its own plan is lost.
-fn keep_inputs(args: &PlanArgs) -> Result<(), String> {
+/// Refuses to overwrite an input with an output.
+fn check_outputs(args: &PlanArgs) -> Result<(), String> {
     let part = &args.part;
-    // These two are a file or six numbers; numbers are no file's name that anything here would write.
+    // These two are a file or six numbers; no output has six numbers as its name.
     let (present, base) = (args.present.as_deref().map(Path::new), part.base.as_deref().map(Path::new));
     keep_apart(
         &[("--out", args.out.as_deref()), ("--overlay", args.overlay.as_deref()), ("--report", args.report.as_deref())],
@@ -75,7 +75,7 @@ fn keep_inputs(args: &PlanArgs) -> Result<(), String> {
     )
 }
 
-/// Prints what came out; the class says with which code the program ends.
+/// Prints the outcome; its class selects the exit code.
 fn finish(args: &PlanArgs, outcome: Outcome) -> Result<Exit, Failure> {
     if args.json {
         print_line(&outcome.json);
@@ -94,7 +94,7 @@ fn finish(args: &PlanArgs, outcome: Outcome) -> Result<Exit, Failure> {
     Err(Failure { exit, message: outcome.text })
 }
 
-/// Prints a line. A reader that has seen enough (`| head`) is no failure of the plan, which is written by then.
+/// Prints a line. A closed pipe (`| head`) is not an error: the plan is written by then.
 fn print_line(line: &dyn std::fmt::Display) {
     let _ = writeln!(std::io::stdout(), "{line}");
 }

@@ -10,36 +10,36 @@ use crate::wiring;
 /// `graspd run`: the daemon.
 ///
 /// # Errors
-/// Configuration, links, or a fault of our own.
+/// A wrong configuration, a failed link, or a bug of graspd.
 pub fn run(args: &RunArgs) -> Result<Exit, Failure> {
     let config = Config::load(&args.config)?;
-    log::take_panics();
+    log::log_panics();
     ignore_background_writes();
     wiring::run(&config, &args.config)
 }
 
-/// `graspd check`: reads the configuration and every file it names, and touches nothing.
+/// `graspd check`: reads the configuration and every file it names; changes nothing.
 ///
 /// # Errors
-/// What is wrong, by file and key.
+/// The first wrong value, with its file and key.
 pub fn check(args: &RunArgs) -> Result<Exit, Failure> {
     let config = Config::load(&args.config)?;
-    println!("{}: good", args.config.display());
+    println!("{}: valid", args.config.display());
     println!("  cell      {}", config.names.cell());
     println!("  rig       {} ({}x{})", config.rig.hash(), config.rig.rig.left.width, config.rig.rig.left.height);
     println!("  gripper   {} ({} marks)", config.gripper.hash(), config.gripper.gripper.marks.len());
-    println!("  arm       {} at {}", config.raw.arm.model, config.raw.arm.address);
+    println!("  arm       {} at {}", config.arm.model.name(), config.arm.address);
     println!(
         "  dh table  {}",
-        match &config.kinematics {
+        match &config.arm.kinematics {
             Kinematics::Controller => "the controller's own".to_owned(),
-            Kinematics::Nominal => format!("nominal {}", config.raw.arm.model),
+            Kinematics::Nominal => format!("nominal {}", config.arm.model.name()),
             Kinematics::File(path, _) => path.display().to_string(),
         }
     );
     let s = config.stop;
     println!(
-        "  stop      from full speed: {:.0} ms, {:.1} degrees a joint, {:.1} mm of the gripper; the arm's own reaction comes before it",
+        "  stop      from full speed: {:.0} ms, {:.1} degrees a joint, {:.1} mm of the gripper, after the arm's own reaction time",
         s.time_s * 1e3,
         s.joint_rad.to_degrees(),
         s.tcp_m * 1e3

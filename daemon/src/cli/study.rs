@@ -1,9 +1,9 @@
-//! `graspd study`: Monte Carlo over the accuracy study's scenes.
+//! `graspd study`: Monte Carlo simulation of the accuracy study.
 
 use super::args::StudyArgs;
 use crate::exit::{Exit, Failure};
 
-/// Runs it and prints the table.
+/// Runs the study and prints its table.
 ///
 /// # Errors
 /// Usage.
@@ -18,10 +18,10 @@ pub fn study(args: &StudyArgs) -> Result<Exit, Failure> {
     };
     if cells.is_empty() {
         let names: Vec<&str> = all.iter().map(|c| c.name).collect();
-        let asked = args.cell.as_deref().unwrap_or_default();
+        let pattern = args.cell.as_deref().unwrap_or_default();
         return Err(Failure {
             exit: Exit::Usage,
-            message: format!("--cell {asked}: the cells are {}", names.join("; ")),
+            message: format!("--cell {pattern}: no such cell; the cells are {}", names.join("; ")),
         });
     }
     let table = graspd_calib::commands::study::table(&cells, args.trials, args.seed, |cell| eprintln!("{cell}"));

@@ -1,6 +1,6 @@
-//! An arm's kinematics from a file.
+//! The arm's kinematics from a file.
 
-use crate::arm::{SAME_ARM, flanges_apart};
+use crate::arm::{MAX_FLANGE_DISTANCE_M, flange_distance};
 use crate::exit::Failure;
 use graspd_rt::arm::{Dh, Model};
 use std::path::Path;
@@ -8,7 +8,7 @@ use std::path::Path;
 #[derive(serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 struct KinematicsFile {
-    /// The model that the table belongs to; compared with the configuration's where it is given.
+    /// Model of the arm; where present it must be the configuration's.
     model: Option<String>,
     dh: DhTable,
 }
@@ -26,7 +26,7 @@ struct DhTable {
 /// optionally the `model` that it belongs to.
 ///
 /// # Errors
-/// Names the file, the key and the fix; another model's table is refused.
+/// Names the file, the key and the fix. A table of another model is refused.
 pub fn load_kinematics(path: &Path, model: Model) -> Result<Dh, Failure> {
     let shown = path.display();
     let text = std::fs::read_to_string(path).map_err(|e| {
@@ -49,20 +49,20 @@ pub fn load_kinematics(path: &Path, model: Model) -> Result<Dh, Failure> {
             if !(v.is_finite() && v.abs() <= limit) {
                 let unit = if limit < 5.0 { "m, not mm" } else { "rad, not degrees" };
                 return Err(Failure::input(format!(
-                    "{shown}: dh.{name}[{i}] = {v} is no arm's; it must lie within {limit} of zero ({unit})"
+                    "{shown}: dh.{name}[{i}] = {v} is out of range: its magnitude must be at most {limit} ({unit})"
                 )));
             }
         }
     }
     let dh = Dh { a: t.a, d: t.d, alpha: t.alpha, theta: t.theta };
-    let apart = flanges_apart(&dh, &Dh::nominal(model));
-    if !(apart < SAME_ARM) {
+    let distance_m = flange_distance(&dh, &Dh::nominal(model));
+    if !(distance_m < MAX_FLANGE_DISTANCE_M) {
         return Err(Failure::input(format!(
-            "{shown}: [dh] puts the flange up to {:.0} mm away from a {}'s (a unit as built lies within {:.0} mm): give lengths in \
-             metres and angles in radians, of this very arm",
-            apart * 1e3,
+            "{shown}: [dh] puts the flange up to {:.0} mm away from where a {} has it (calibrated arms differ by less than {:.0} mm): \
+             give lengths in metres and angles in radians, and the table of this arm",
+            distance_m * 1e3,
             model.name(),
-            SAME_ARM * 1e3
+            MAX_FLANGE_DISTANCE_M * 1e3
         )));
     }
     Ok(dh)

@@ -1,4 +1,4 @@
-//! A fixed-rate cycle on absolute deadlines.
+//! A fixed-rate timer with absolute deadlines.
 
 use rustix::thread::{ClockId, clock_nanosleep_absolute};
 use rustix::time::{Timespec, clock_gettime};
@@ -9,25 +9,25 @@ pub fn now_ns() -> u64 {
     u64::try_from(t.tv_sec).unwrap_or(0) * 1_000_000_000 + u64::try_from(t.tv_nsec).unwrap_or(0)
 }
 
-/// One cycle, as it really came.
+/// The start of one cycle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Tick {
-    /// When the thread should have woken.
+    /// Deadline, CLOCK_MONOTONIC, ns.
     pub deadline_ns: u64,
-    /// When it woke.
+    /// Time at which the thread woke, ns.
     pub woke_ns: u64,
-    /// Whole periods of the grid that were missed since the last cycle; 0 in good health.
+    /// Number of whole periods missed since the last cycle.
     pub skipped: u64,
 }
 
 impl Tick {
-    /// How late the thread woke.
+    /// Delay of the wake-up, ns.
     pub fn lateness_ns(&self) -> u64 {
         self.woke_ns.saturating_sub(self.deadline_ns)
     }
 }
 
-/// A periodic cycle that keeps its grid: a late cycle is counted, never caught up with a burst.
+/// A periodic timer on a fixed grid: missed periods are counted and never made up by a burst of cycles.
 #[derive(Debug)]
 pub struct CycleTimer {
     period_ns: u64,
@@ -36,14 +36,15 @@ pub struct CycleTimer {
 }
 
 impl CycleTimer {
-    /// A cycle of this period, the first one a period from now. With `spin_ns` above zero the thread wakes that much earlier and
-    /// spins to the deadline; it must stay a small share of the period (the kernel throttles FIFO threads that never sleep).
+    /// A timer with this period; the first deadline is one period from now. With `spin_ns` above zero the thread wakes
+    /// that much earlier and spins to the deadline. At most a fifth of the period is used: the kernel throttles FIFO
+    /// threads that never sleep.
     pub fn new(period_ns: u64, spin_ns: u64) -> Self {
         let period_ns = period_ns.max(1);
         Self { period_ns, spin_ns: spin_ns.min(period_ns / 5), next_ns: now_ns() + period_ns }
     }
 
-    /// Sleeps to the next deadline of the grid.
+    /// Sleeps until the next deadline.
     pub fn wait(&mut self) -> Tick {
         let deadline = self.next_ns;
         sleep_until(deadline.saturating_sub(self.spin_ns));
@@ -57,14 +58,14 @@ impl CycleTimer {
     }
 }
 
-/// Sleeps to an instant of CLOCK_MONOTONIC, ns; returns at once when it has passed.
+/// Sleeps until a time of CLOCK_MONOTONIC, ns; returns immediately when it has passed.
 pub fn sleep_until(until_ns: u64) {
     let ts = Timespec {
         tv_sec: i64::try_from(until_ns / 1_000_000_000).unwrap_or(i64::MAX),
         tv_nsec: i64::try_from(until_ns % 1_000_000_000).unwrap_or(0),
     };
-    // EINTR returns early; the deadline stands, so ask again. Any other error cannot happen for a valid time on this clock,
-    // and falling through then only makes this cycle early, never the next one late.
+    // After EINTR the sleep continues to the same deadline. No other error is possible for a valid time on this clock;
+    // it would only make this cycle early, and no cycle late.
     while let Err(rustix::io::Errno::INTR) = clock_nanosleep_absolute(ClockId::Monotonic, &ts) {}
 }
 
@@ -73,13 +74,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_grid_is_kept_after_a_stall() {
-        let mut b = CycleTimer::new(2_000_000, 0);
-        let first = b.wait();
+    fn a_stall_does_not_shift_the_grid() {
+        let mut timer = CycleTimer::new(2_000_000, 0);
+        let first = timer.wait();
         std::thread::sleep(std::time::Duration::from_millis(9));
-        let late = b.wait();
+        let late = timer.wait();
         assert!(late.skipped >= 2, "a stall of 4.5 periods skips whole periods: {late:?}");
-        let next = b.wait();
+        let next = timer.wait();
         assert_eq!((next.deadline_ns - first.deadline_ns) % 2_000_000, 0, "deadlines stay on one grid");
         assert!(next.deadline_ns > late.woke_ns, "no burst of cycles to catch up");
     }

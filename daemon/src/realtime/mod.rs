@@ -1,4 +1,4 @@
-//! What makes a thread a real-time thread: priority, place, locked memory, and a cycle on an absolute grid.
+//! Real-time threads: priority, CPU, locked memory, and a timer with absolute deadlines.
 
 mod cycle_timer;
 mod setup;

@@ -1,10 +1,10 @@
-//! Entering real time, and saying in words what the host refused.
+//! Real-time scheduling of threads, with a message for everything that the host refuses.
 
 use super::sys;
 use rustix::mm::{MlockAllFlags, mlockall};
 use rustix::thread::{CpuSet, sched_setaffinity};
 
-/// Priority and place of one real-time thread.
+/// Priority and CPU of one real-time thread.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ThreadSettings {
     /// SCHED_FIFO priority; 0 leaves the thread under the ordinary scheduler.
@@ -13,42 +13,44 @@ pub struct ThreadSettings {
     pub core: Option<usize>,
 }
 
-/// What was asked of the host and what it gave.
+/// What the host refused.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RealtimeReport {
-    /// One sentence for each thing that was refused, with what to do about it. Empty on a host that gave everything.
+    /// One message for each refused setting, with what to do. Empty where nothing was refused.
     pub refused: Vec<String>,
 }
 
 impl RealtimeReport {
-    /// Whether the host gave everything that was asked for.
+    /// Whether nothing was refused.
     pub fn complete(&self) -> bool {
         self.refused.is_empty()
     }
 }
 
-/// Locks the process's present and future memory; future mappings are locked only as they are touched, so that a camera that
-/// reconnects cannot stall the mapping thread for the time its whole segment takes to fault in.
+/// Locks the present and future memory of the process. Future mappings are locked page by page on first access, so that
+/// a camera that reconnects does not stall the mapping thread until its whole segment is resident.
 pub fn lock_memory(report: &mut RealtimeReport) {
     if let Err(e) = mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT) {
         report.refused.push(format!(
-            "memory could not be locked ({e}): a page fault may delay the loop; raise RLIMIT_MEMLOCK (systemd: LimitMEMLOCK=infinity)"
+            "memory could not be locked ({e}): a page fault may delay a cycle; raise RLIMIT_MEMLOCK (systemd: LimitMEMLOCK=infinity)"
         ));
     }
 }
 
-/// Gives the calling thread its priority and place, and faults in a stack's worth of pages.
+/// Sets priority and CPU of the calling thread, and touches the pages of its stack.
 pub fn enter(name: &str, settings: &ThreadSettings, report: &mut RealtimeReport) {
     if let Some(core) = settings.core {
         if core >= CpuSet::MAX_CPU {
-            report.refused.push(format!("thread {name}: core {core} does not exist; change loop.core in graspd.toml"));
+            report
+                .refused
+                .push(format!("thread {name}: core {core} does not exist; change loop.{name}_core in graspd.toml"));
         } else {
             let mut set = CpuSet::new();
             set.set(core);
             if let Err(e) = sched_setaffinity(None, &set) {
-                report
-                    .refused
-                    .push(format!("thread {name} could not be pinned to core {core} ({e}); change the core in [loop]"));
+                report.refused.push(format!(
+                    "thread {name} could not be pinned to core {core} ({e}); change loop.{name}_core in graspd.toml"
+                ));
             }
         }
     }
@@ -62,7 +64,7 @@ pub fn enter(name: &str, settings: &ThreadSettings, report: &mut RealtimeReport)
     prefault_stack();
 }
 
-/// Touches 256 KiB of stack so that the loop's deepest call never meets a page for the first time.
+/// Touches 256 KiB of stack, so that no call of a cycle touches a stack page for the first time.
 #[inline(never)]
 fn prefault_stack() {
     let mut page = [0u8; 256 * 1024];

@@ -1,9 +1,9 @@
-//! The stop thread: takes connections, reads one word, pulls the latch, answers with one of a few fixed lines.
+//! The stop thread: accepts connections, reads one command, sets the stop latch, answers with a fixed line.
 //!
-//! It allocates, locks, logs and formats nothing, and every wait of it is bounded. Whoever connects is asked for his
-//! credentials by the kernel; only the daemon's own user and root are heard.
+//! It does not allocate, lock, log or format, and every wait is bounded. The kernel gives the credentials of each
+//! client; only the daemon's user and root are accepted.
 
-use super::live::{By, Live};
+use super::live::{LiveState, StopSource};
 use crate::realtime::now_ns;
 use graspd_rt::mode::ModeName;
 use rustix::event::{PollFd, PollFlags, poll};
@@ -13,40 +13,40 @@ use std::os::fd::AsFd;
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::sync::Arc;
 
-/// Connections served at once; the oldest makes room.
-const CLIENTS: usize = 16;
-/// How long a connection may take to ask, ns.
-const PATIENCE_NS: u64 = 250_000_000;
-/// How long the answer waits for the ramp to begin, ns: many cycles.
-const RAMP_NS: u64 = 100_000_000;
-/// Pause after a round that had work: a flood of connections gets at most so many rounds a second, and no processor.
+/// Maximum number of connections; a new one replaces the oldest.
+const MAX_CLIENTS: usize = 16;
+/// Timeout of a connection's command, ns.
+const COMMAND_TIMEOUT_NS: u64 = 250_000_000;
+/// Time that the answer waits for the ramp to begin, ns: many cycles.
+const RAMP_TIMEOUT_NS: u64 = 100_000_000;
+/// Pause after a round with work, ns: bounds the processor time that many connections can take.
 const PAUSE_NS: i64 = 500_000;
-/// The word that stops.
-const WORD: &[u8] = b"stop\n";
+/// The command that stops.
+const COMMAND: &[u8] = b"stop\n";
 
-/// When and how the process is ended although its threads have not come back.
+/// When and with which exit code the process is ended although threads are still running.
 #[derive(Clone, Copy, Debug)]
-pub struct End {
-    /// After the end was asked for, ns.
+pub struct ForcedExit {
+    /// Time after the end was requested, ns.
     pub after_ns: u64,
-    /// After the ordered end has come about and only threads are waited for, ns; with that end's own code.
-    pub settled_ns: u64,
-    /// The exit code where no ordered end has come about; 0 where no cycle has run and nothing could move.
+    /// Time after the regular end, when only threads are waited for, ns; with the exit code of that end.
+    pub finished_ns: u64,
+    /// Exit code without a regular end; 0 is used when no cycle has run and nothing could move.
     pub code: u8,
 }
 
-impl End {
-    /// The code to end with at `now`, if it is time. The instants are when the end was asked for, and when it had come
-    /// about.
-    fn due(&self, live: &Live, now: u64, asked: &mut Option<u64>, settled: &mut Option<u64>) -> Option<u8> {
+impl ForcedExit {
+    /// The exit code, if the process has to be ended at `now`. `requested` and `finished` keep the times at which the
+    /// end was requested and the regular end was reached.
+    fn due(&self, live: &LiveState, now: u64, requested: &mut Option<u64>, finished: &mut Option<u64>) -> Option<u8> {
         let passed = |since: &mut Option<u64>, limit: u64| now.saturating_sub(*since.get_or_insert(now)) > limit;
-        if let Some(code) = live.settled()
-            && passed(settled, self.settled_ns)
+        if let Some(code) = live.finished()
+            && passed(finished, self.finished_ns)
         {
             return Some(code);
         }
-        let late = live.ending() && passed(asked, self.after_ns);
-        late.then(|| live.settled().unwrap_or(if live.cycles() == 0 { 0 } else { self.code }))
+        let late = live.ending() && passed(requested, self.after_ns);
+        late.then(|| live.finished().unwrap_or(if live.cycles() == 0 { 0 } else { self.code }))
     }
 }
 
@@ -54,41 +54,43 @@ impl End {
 struct Client {
     stream: UnixStream,
     since_ns: u64,
-    heard: usize,
-    /// The cycle at which the latch was pulled for this client, and when.
-    asked: Option<(u64, u64)>,
+    /// Number of bytes of the command that have arrived.
+    received: usize,
+    /// The cycle count and the time, ns, at which the latch was set for this client.
+    stopped_at: Option<(u64, u64)>,
 }
 
-/// Serves until the daemon is over.
-pub fn serve(listener: &UnixListener, live: &Arc<Live>, end: End) {
+/// Serves until the daemon has ended.
+pub fn serve(listener: &UnixListener, live: &Arc<LiveState>, forced: ForcedExit) {
     let uid = rustix::process::geteuid().as_raw();
-    let mut clients: [Option<Client>; CLIENTS] = std::array::from_fn(|_| None);
+    let mut clients: [Option<Client>; MAX_CLIENTS] = std::array::from_fn(|_| None);
     let mut next = 0;
-    let (mut asked, mut settled) = (None, None);
-    while !live.over() {
+    let (mut requested, mut finished) = (None, None);
+    while !live.closed() {
         let waits = wait(listener, &clients);
         let now = now_ns();
-        if let Some(code) = end.due(live, now, &mut asked, &mut settled) {
+        if let Some(code) = forced.due(live, now, &mut requested, &mut finished) {
             crate::realtime::exit_now(code);
         }
         if waits {
-            for _ in 0..CLIENTS {
+            for _ in 0..MAX_CLIENTS {
                 let Ok((stream, _)) = listener.accept() else { break };
                 if stream.set_nonblocking(true).is_err() || !may_stop(&stream, uid) {
                     continue;
                 }
-                // A free place, or that of the oldest: places are given in turn.
-                let place = (0..CLIENTS).map(|k| (next + k) % CLIENTS).find(|k| clients[*k].is_none()).unwrap_or(next);
-                clients[place] = Some(Client { stream, since_ns: now, heard: 0, asked: None });
-                next = (place + 1) % CLIENTS;
+                // A free slot, or the slot of the oldest connection: slots are assigned in turn.
+                let slot =
+                    (0..MAX_CLIENTS).map(|k| (next + k) % MAX_CLIENTS).find(|k| clients[*k].is_none()).unwrap_or(next);
+                clients[slot] = Some(Client { stream, since_ns: now, received: 0, stopped_at: None });
+                next = (slot + 1) % MAX_CLIENTS;
             }
         }
         let mut busy = false;
-        for place in &mut clients {
-            if let Some(client) = place {
+        for slot in &mut clients {
+            if let Some(client) = slot {
                 busy = true;
-                if client.look(live, now) {
-                    *place = None;
+                if client.poll(live, now) {
+                    *slot = None;
                 }
             }
         }
@@ -99,44 +101,44 @@ pub fn serve(listener: &UnixListener, live: &Arc<Live>, end: End) {
     }
 }
 
-/// Waits for a connection or a word; true when the listener has one. While an answer is owed it looks every
-/// millisecond.
-fn wait(listener: &UnixListener, clients: &[Option<Client>; CLIENTS]) -> bool {
-    let owed = clients.iter().flatten().any(|c| c.asked.is_some());
-    let timeout = Timespec { tv_sec: 0, tv_nsec: if owed { 1_000_000 } else { 50_000_000 } };
+/// Waits for a connection or a command, at most 50 ms, or 1 ms while an answer is pending; true when the listener has a
+/// connection.
+fn wait(listener: &UnixListener, clients: &[Option<Client>; MAX_CLIENTS]) -> bool {
+    let pending = clients.iter().flatten().any(|c| c.stopped_at.is_some());
+    let timeout = Timespec { tv_sec: 0, tv_nsec: if pending { 1_000_000 } else { 50_000_000 } };
     let listening = listener.as_fd();
-    // Places without a client look at the listener as well: the array has one length, and nothing is allocated for it.
-    let borrowed: [_; CLIENTS] = std::array::from_fn(|k| {
-        clients[k].as_ref().filter(|c| c.asked.is_none()).map_or(listening, |c| c.stream.as_fd())
+    // Slots without a client poll the listener as well: an array of fixed length needs no allocation.
+    let borrowed: [_; MAX_CLIENTS] = std::array::from_fn(|k| {
+        clients[k].as_ref().filter(|c| c.stopped_at.is_none()).map_or(listening, |c| c.stream.as_fd())
     });
-    let mut fds: [PollFd<'_>; CLIENTS + 1] =
+    let mut fds: [PollFd<'_>; MAX_CLIENTS + 1] =
         std::array::from_fn(|k| PollFd::from_borrowed_fd(*borrowed.get(k).unwrap_or(&listening), PollFlags::IN));
-    matches!(poll(&mut fds, Some(&timeout)), Ok(n) if n > 0) && !fds[CLIENTS].revents().is_empty()
+    matches!(poll(&mut fds, Some(&timeout)), Ok(n) if n > 0) && !fds[MAX_CLIENTS].revents().is_empty()
 }
 
-/// Whether the kernel says that the other end is our own user or root.
+/// Whether the peer is the daemon's user or root, by the kernel's credentials.
 fn may_stop(stream: &UnixStream, uid: u32) -> bool {
     rustix::net::sockopt::socket_peercred(stream).is_ok_and(|c| c.uid.as_raw() == uid || c.uid.is_root())
 }
 
 impl Client {
-    /// Reads, asks, answers; true when the connection is done with.
-    fn look(&mut self, live: &Live, now: u64) -> bool {
-        if let Some((cycle, at)) = self.asked {
+    /// Reads the command, sets the latch, answers; true when the connection is finished.
+    fn poll(&mut self, live: &LiveState, now: u64) -> bool {
+        if let Some((cycle, at)) = self.stopped_at {
             let mode = live.mode();
-            // The cycle after the one that may have been under way has taken the latch.
+            // One cycle may have been in progress; the one after it has taken the latch.
             let taken = live.cycles() >= cycle + 2 && !matches!(mode, Some(ModeName::Servoing | ModeName::Converged));
-            if taken || mode.is_none() || now.saturating_sub(at) > RAMP_NS {
+            if taken || mode.is_none() || now.saturating_sub(at) > RAMP_TIMEOUT_NS {
                 let _ = self.stream.write(answer(taken, mode));
                 return true;
             }
             return false;
         }
-        let mut word = [0u8; WORD.len()];
-        let rest = word.len() - self.heard;
-        match self.stream.read(&mut word[..rest]) {
+        let mut bytes = [0u8; COMMAND.len()];
+        let rest = bytes.len() - self.received;
+        match self.stream.read(&mut bytes[..rest]) {
             Ok(0) => return true,
-            Ok(n) if word[..n] == WORD[self.heard..self.heard + n] => self.heard += n,
+            Ok(n) if bytes[..n] == COMMAND[self.received..self.received + n] => self.received += n,
             Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => {}
             Ok(_) => {
                 let _ = self.stream.write(b"unknown\n");
@@ -144,16 +146,16 @@ impl Client {
             }
             Err(_) => return true,
         }
-        if self.heard == WORD.len() {
-            self.asked = Some((live.cycles(), now));
-            live.stop(By::Socket);
+        if self.received == COMMAND.len() {
+            self.stopped_at = Some((live.cycles(), now));
+            live.stop(StopSource::Socket);
             return false;
         }
-        now.saturating_sub(self.since_ns) > PATIENCE_NS
+        now.saturating_sub(self.since_ns) > COMMAND_TIMEOUT_NS
     }
 }
 
-/// `stopped MODE`, or `late MODE` when no cycle has taken the latch in time.
+/// `stopped MODE`, or `late MODE` when no cycle has taken the latch within the timeout.
 const fn answer(taken: bool, mode: Option<ModeName>) -> &'static [u8] {
     match (taken, mode) {
         (_, None) => b"stopped starting\n",
@@ -176,22 +178,22 @@ mod tests {
     use std::sync::atomic::Ordering;
 
     #[test]
-    fn a_process_that_hangs_is_ended_in_time_and_not_before() {
-        let end = End { after_ns: 1000, settled_ns: 100, code: 4 };
-        let live = Live::default();
-        let (mut asked, mut settled) = (None, None);
-        assert_eq!(end.due(&live, 50_000, &mut asked, &mut settled), None, "nobody asked");
+    fn a_process_that_hangs_is_ended_at_its_limits_and_not_before() {
+        let forced = ForcedExit { after_ns: 1000, finished_ns: 100, code: 4 };
+        let live = LiveState::default();
+        let (mut requested, mut finished) = (None, None);
+        assert_eq!(forced.due(&live, 50_000, &mut requested, &mut finished), None, "no end requested");
         live.end.store(true, Ordering::Release);
-        assert_eq!(end.due(&live, 60_000, &mut asked, &mut settled), None);
-        assert_eq!(end.due(&live, 61_000, &mut asked, &mut settled), None);
-        assert_eq!(end.due(&live, 61_001, &mut asked, &mut settled), Some(0), "nothing was ever driven");
-        live.note(ModeName::Idle, false, false);
-        assert_eq!(end.due(&live, 61_001, &mut asked, &mut settled), Some(4));
-        // The ordered end came about; only threads are missing.
-        let (mut asked, mut settled) = (Some(60_000), None);
-        live.settle(5);
-        assert_eq!(end.due(&live, 60_010, &mut asked, &mut settled), None);
-        assert_eq!(end.due(&live, 60_110, &mut asked, &mut settled), None);
-        assert_eq!(end.due(&live, 60_111, &mut asked, &mut settled), Some(5));
+        assert_eq!(forced.due(&live, 60_000, &mut requested, &mut finished), None);
+        assert_eq!(forced.due(&live, 61_000, &mut requested, &mut finished), None);
+        assert_eq!(forced.due(&live, 61_001, &mut requested, &mut finished), Some(0), "nothing was ever commanded");
+        live.record(ModeName::Idle, false, false);
+        assert_eq!(forced.due(&live, 61_001, &mut requested, &mut finished), Some(4));
+        // The regular end is reached; only threads are still running.
+        let (mut requested, mut finished) = (Some(60_000), None);
+        live.finish(5);
+        assert_eq!(forced.due(&live, 60_010, &mut requested, &mut finished), None);
+        assert_eq!(forced.due(&live, 60_110, &mut requested, &mut finished), None);
+        assert_eq!(forced.due(&live, 60_111, &mut requested, &mut finished), Some(5));
     }
 }

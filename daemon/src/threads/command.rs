@@ -1,17 +1,18 @@
-//! The command thread: a cycle of its own, robot state in, one set-point out. It touches no iceoryx2, no lock and no heap.
+//! The command thread: one cycle a period, robot state in, one set-point out. It does not use iceoryx2, locks or the
+//! heap.
 
+use super::cycle_report::CycleReport;
 use super::shared::{JointSample, Shared};
-use super::telemetry::CycleReport;
 use crate::arm::{ArmLink, LinkPoll};
 use crate::realtime::{CycleTimer, Tick, now_ns, sleep_until};
 use graspd_rt::arm::RobotState;
 use graspd_rt::cycle::{CommandCycle, CommandInput, LinkStatus};
-use graspd_rt::online::Vision;
+use graspd_rt::online::mid_exposure_ns;
 use graspd_rt::rtde::PhaseLock;
 use std::sync::atomic::Ordering;
 
-/// Commands whose sending time is kept, to measure the round trip by the echoed heartbeat.
-const SENT: usize = 256;
+/// Number of commands whose sending time is kept, to measure the round trip by the echoed heartbeat.
+const SENT_TIMES: usize = 256;
 
 /// The command thread's state.
 pub struct CommandWorker<'a> {
@@ -20,11 +21,11 @@ pub struct CommandWorker<'a> {
     link: Option<Box<dyn ArmLink>>,
     status: LinkStatus,
     robot: Option<RobotState>,
-    /// State packages that the last poll took.
+    /// State packages that the last poll received.
     packages: u32,
-    /// The capture time of the newest pair that no command has answered yet.
-    unanswered: Option<u64>,
-    sent_ns: [(i32, u64); SENT],
+    /// Mid-exposure time of the newest pair that no command has used yet, ns.
+    unused_frame_ns: Option<u64>,
+    sent_ns: [(i32, u64); SENT_TIMES],
     echo: i32,
 }
 
@@ -35,7 +36,7 @@ impl std::fmt::Debug for CommandWorker<'_> {
 }
 
 impl<'a> CommandWorker<'a> {
-    /// A worker without a link; the link manager hands it one.
+    /// A worker without a link; the link manager provides it.
     pub fn new(cycle: CommandCycle, shared: &'a Shared) -> Self {
         Self {
             shared,
@@ -44,8 +45,8 @@ impl<'a> CommandWorker<'a> {
             status: LinkStatus::default(),
             robot: None,
             packages: 0,
-            unanswered: None,
-            sent_ns: [(0, 0); SENT],
+            unused_frame_ns: None,
+            sent_ns: [(0, 0); SENT_TIMES],
             echo: 0,
         }
     }
@@ -59,22 +60,22 @@ impl<'a> CommandWorker<'a> {
         }
     }
 
-    /// Runs until shutdown on the robot's cycle: its package, then the command, which so lands in its next step. Without a robot, or
-    /// with one that is silent, a timer.
+    /// Runs until shutdown with the robot as the clock: each cycle waits for the robot's package, and its command takes
+    /// effect in the robot's next step. Without packages the cycle runs by a timer.
     pub fn run_with_robot(&mut self, period_ns: u64) {
         let mut lock = PhaseLock::new(period_ns, now_ns());
         let mut skipped = 0;
         while !self.shared.ending() {
             let deadline_ns = lock.next_ns();
             sleep_until(lock.listen_ns());
-            let come = match self.link.as_mut() {
+            let arrived = match self.link.as_mut() {
                 Some(link) => link.wait(lock.give_up_ns()),
                 None => false,
             };
-            if !come {
+            if !arrived {
                 sleep_until(lock.give_up_ns());
             }
-            sleep_until(lock.arrived(now_ns(), come));
+            sleep_until(lock.arrived(now_ns(), arrived));
             self.cycle(&Tick { deadline_ns, woke_ns: now_ns(), skipped });
             let stamp = self.robot.filter(|_| self.packages == 1).map(|r| r.timestamp_s);
             skipped = lock.advance(now_ns(), stamp);
@@ -96,18 +97,18 @@ impl<'a> CommandWorker<'a> {
         let state = self.poll(now);
         let mut round_trip_ns = None;
         if let Some(s) = &state {
-            // A full queue means a vision thread that does not read; its own age checks speak for that.
+            // The queue is full when the vision thread does not read; the age limits of the images detect that.
             let _ = self.shared.joints.push(JointSample { at_ns: s.received_ns, q: s.q });
             if s.echo != self.echo {
                 self.echo = s.echo;
-                let (cycle, at) = self.sent_ns[s.echo.rem_euclid(SENT as i32) as usize];
+                let (cycle, at) = self.sent_ns[s.echo.rem_euclid(SENT_TIMES as i32) as usize];
                 round_trip_ns = (cycle == s.echo && at > 0).then(|| s.received_ns.saturating_sub(at));
             }
             self.robot = Some(*s);
         }
         let vision = self.shared.vision.take();
         if let Some(v) = &vision {
-            self.unanswered = Some(middle(v));
+            self.unused_frame_ns = Some(mid_exposure_ns(v.capture_ns));
         }
         let setpoint = self.shared.setpoint.take();
         let request = if self.shared.live.take() {
@@ -127,26 +128,27 @@ impl<'a> CommandWorker<'a> {
         self.send(&out.command);
         let done = now_ns();
         let moving = out.command.rates.iter().any(|r| *r != 0.0);
-        self.shared.live.note(out.record.mode, moving, self.link.is_some());
+        self.shared.live.record(out.record.mode, moving, self.link.is_some());
         if let Some(reply) = out.reply {
             let _ = self.shared.replies.force_push(reply);
         }
         if let Some(reply) = out.setpoint_reply {
             self.shared.setpoint_reply.put(reply);
         }
-        let note = CycleReport {
+        let report = CycleReport {
             record: out.record,
             event: out.event,
             wakeup_ns: tick.lateness_ns(),
             compute_ns: done.saturating_sub(tick.woke_ns),
             skipped: tick.skipped,
-            frame_to_command_ns: self.unanswered.take().map(|at| done.saturating_sub(at)),
+            frame_to_command_ns: self.unused_frame_ns.take().map(|at| done.saturating_sub(at)),
             round_trip_ns,
             link: if self.link.is_some() { 2 } else { 1 },
             robot: self.robot.map_or((-1, 0), |r| (r.robot_mode, r.safety_status_bits)),
         };
-        // A full ring means a telemetry thread that does not read: the oldest notes go, the loop does not wait.
-        let _ = self.shared.records.force_push(note);
+        // The ring is full when the telemetry thread does not read: the oldest record is dropped, and the cycle does
+        // not wait.
+        let _ = self.shared.records.force_push(report);
     }
 
     fn poll(&mut self, now: u64) -> Option<RobotState> {
@@ -172,14 +174,14 @@ impl<'a> CommandWorker<'a> {
         match link.send(command) {
             Ok(()) if link.stats().dropped == dropped => {
                 self.status.blocked_sends = 0;
-                self.sent_ns[command.heartbeat.rem_euclid(SENT as i32) as usize] = (command.heartbeat, now_ns());
+                self.sent_ns[command.heartbeat.rem_euclid(SENT_TIMES as i32) as usize] = (command.heartbeat, now_ns());
             }
             Ok(()) => self.status.blocked_sends = self.status.blocked_sends.saturating_add(1),
             Err(_) => self.drop_link(),
         }
     }
 
-    /// Hands a dead link to the manager, which closes it and makes another one: both take time that this thread has not.
+    /// Hands a failed link to the link manager, which closes it and makes a new one: both may block.
     fn drop_link(&mut self) {
         if let Some(link) = self.link.take() {
             self.shared.link_dead.put(link);
@@ -187,9 +189,4 @@ impl<'a> CommandWorker<'a> {
         self.status = LinkStatus::default();
         self.robot = None;
     }
-}
-
-fn middle(v: &Vision) -> u64 {
-    let [a, b] = v.capture_ns;
-    a.min(b) + a.abs_diff(b) / 2
 }

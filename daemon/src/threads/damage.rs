@@ -1,20 +1,21 @@
-//! The watch over the files of the shared memory: an ordinary thread that looks whether they are still what they were.
+//! The watch over the files of the shared memory: an ordinary thread that checks whether they are still present and
+//! unchanged.
 
 use super::shared::Shared;
 use crate::log;
-use crate::stop::By;
+use crate::stop::StopSource;
 use graspd_shm::{ShmNode, Vital};
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-/// How often it looks: with it lies the longest time that a daemon drives without being found by its verbs.
+/// Period of the check: the maximum time for which the daemon moves the arm without being reachable by its verbs.
 const PERIOD: Duration = Duration::from_millis(200);
-/// Until every thread has made its ports. An arming takes longer.
-const SETTLE: Duration = Duration::from_millis(600);
+/// Time until every thread has created its ports; arming takes longer.
+const STARTUP: Duration = Duration::from_millis(600);
 
-/// Runs until shutdown, or until something is damaged: then the arm is stopped and the process ends with that reason,
-/// for nothing that reaches it any more could start or end anything. `more` are files of ours beside the middleware's.
+/// Runs until shutdown, or until a file is damaged: then the arm is stopped and the process ends with that reason,
+/// because its verbs may no longer reach it. `more` are the daemon's files in addition to the middleware's.
 pub fn run(node: &ShmNode, more: &[PathBuf], shared: &Shared) {
     let sleep = |time: Duration| {
         let until = Instant::now() + time;
@@ -22,19 +23,19 @@ pub fn run(node: &ShmNode, more: &[PathBuf], shared: &Shared) {
             std::thread::sleep(Duration::from_millis(20));
         }
     };
-    sleep(SETTLE);
+    sleep(STARTUP);
     let vital = Vital::of(node, more);
     while !shared.ending() {
         if let Some(damage) = vital.damage() {
             let reason = format!(
                 "the shared memory was damaged: {} {}; the arm was stopped. Look for a program that cleans {} or /dev/shm (tmp cleaner, \
-                 RemoveIPC), end every program of this cell and start again",
+                 RemoveIPC), end all programs of this cell and start them again",
                 damage.path.display(),
                 damage.what,
                 node.names().root().display()
             );
-            shared.live.stop(By::Damage);
-            log::say(&reason);
+            shared.live.stop(StopSource::Damage);
+            log::message(&reason);
             let _ = shared.damage.set(reason);
             shared.live.end.store(true, Ordering::Release);
             return;

@@ -1,8 +1,8 @@
-//! What ordinary threads tell each other for the status verb and the log. Locks live here, never on a real-time thread.
+//! The daemon's state as text, for the status verb and the log. It has a lock and is used by ordinary threads only.
 
-use crate::arm::{Said, SaidKind, robot_mode, safety_words};
+use crate::arm::{MessageKind, RobotMessage, SAFETY_STOPPED_BITS, robot_mode_text, safety_bits_text};
 use crate::log;
-use crate::stop::Live;
+use crate::stop::LiveState;
 use crossbeam::queue::ArrayQueue;
 use graspd_rt::cycle::{CycleRecord, Grip, Transition, Why};
 use graspd_rt::mode::{FaultCause, ModeName};
@@ -16,7 +16,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 struct State {
     cause: String,
     link: String,
-    /// How the last link ended: "connecting" follows at once.
+    /// How the last link was lost; kept because `link` changes to "connecting" immediately.
     last_loss: String,
     refused: Vec<String>,
     plan: String,
@@ -24,34 +24,34 @@ struct State {
     lasting: Option<FaultCause>,
     sample: TelemetrySample,
     grip: Grip,
-    /// Age of the newest usable image, ns; `u64::MAX` before the first.
+    /// Age of the newest usable image, ns; `u64::MAX` before the first, 0 before the first cycle.
     image_age_ns: u64,
-    /// Robot mode and safety bits when the link last looked, for the time without telemetry.
+    /// Robot mode and safety bits at the start of the last session, for the time without telemetry.
     controller: Option<(i32, u32)>,
-    /// What the controller has said, the newest last.
-    said: VecDeque<String>,
-    /// Why it stopped, as it said itself; empty once it runs again.
+    /// The last messages of the controller, the newest last.
+    messages: VecDeque<String>,
+    /// Why the controller stopped, by its own message; empty once it runs again.
     stop_cause: String,
-    stop_kind: Option<SaidKind>,
+    stop_kind: Option<MessageKind>,
     recovery: Recovery,
 }
 
-/// A walk out of a stop that an operator has asked for.
+/// A recovery that an operator requested.
 #[derive(Clone, Debug, Default)]
 struct Recovery {
-    /// Counts them, so that who asked can tell the new one from the last.
+    /// Number of recoveries so far, so that a client can distinguish the new one from the last.
     number: u64,
     running: bool,
     steps: Vec<String>,
     error: Option<String>,
 }
 
-/// Messages of the controller that are kept.
-const SAID: usize = 8;
-/// Steps of a recovery that are kept: the chain has fewer.
-const STEPS: usize = 32;
+/// Number of controller messages that are kept.
+const MAX_MESSAGES: usize = 8;
+/// Number of recovery steps that are kept; a recovery has fewer.
+const MAX_STEPS: usize = 32;
 
-/// The daemon's state in words.
+/// The daemon's state as text.
 #[derive(Debug)]
 pub struct Report {
     state: Mutex<State>,
@@ -68,113 +68,110 @@ fn percentiles(p: &Percentiles) -> Value {
     json!({ "p50": p.p50, "p99": p.p99, "p999": p.p999, "max": p.max })
 }
 
-/// Bits of `safety_status_bits` under which the arm does not move.
-const STOPPED: u32 = 0b111_1111_0100;
-
-/// Robot mode and safety in words: by telemetry while a link is up, otherwise as the last session found them.
-fn controller_words(seen: Option<(i32, u32)>, t: &TelemetrySample) -> String {
+/// Text for robot mode and safety: from telemetry while a link is up, otherwise from the start of the last session.
+fn controller_text(seen: Option<(i32, u32)>, t: &TelemetrySample) -> String {
     match if t.link == 2 && t.safety_bits != 0 { Some((t.robot_mode, t.safety_bits)) } else { seen } {
-        Some((mode, safety)) => format!("{}, safety {}", robot_mode(mode), safety_words(safety)),
+        Some((mode, safety)) => format!("{}, safety {}", robot_mode_text(mode), safety_bits_text(safety)),
         None => "unknown".to_owned(),
     }
 }
 
-/// JSON has no NaN.
+/// A number for JSON, which has no NaN.
 fn number(v: f64) -> Value {
     if v.is_finite() { json!(v) } else { Value::Null }
 }
 
 impl Report {
     fn lock(&self) -> MutexGuard<'_, State> {
-        // The state is plain values, whole after every statement: a panic elsewhere does not spoil it.
+        // The state consists of plain values and is valid after every statement: a panic elsewhere does not corrupt it.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Notes a change of mode. What began a stop stays its reason when the arm has come to rest.
+    /// Records a change of mode. The cause of a stop remains when the arm is at rest.
     pub fn transition(&self, event: &Transition, why: &str) {
         if !matches!(event.why, Why::AtRest) {
             why.clone_into(&mut self.lock().cause);
         }
     }
 
-    /// Notes a cycle.
+    /// Records a cycle.
     pub fn cycle(&self, record: &CycleRecord) {
         let mut s = self.lock();
         s.lasting = record.lasting;
         (s.grip, s.image_age_ns) = (record.grip, record.vision_age_ns);
     }
 
-    /// What is wrong with the robot now (in a fault: what still would be after a reset), in words with its code.
+    /// The cause that prevents motion now, with its code; in a fault, the cause that would remain after a reset.
     pub fn lasting(&self) -> Option<String> {
         self.lock().lasting.map(|cause| format!("{}: {cause}", cause.code()))
     }
 
-    /// Why images are refused (empty where they are not), and the age of the newest usable one, ms.
+    /// Why images are refused (empty where they are not), and the age of the newest usable image, ms.
     pub fn images(&self) -> (String, Option<f64>) {
         let s = self.lock();
-        // 0 is what nobody has noted yet.
         let age = Some(s.image_age_ns).filter(|ns| *ns != u64::MAX && *ns != 0);
         (s.refusal.clone(), age.map(|ns| ns as f64 * 1e-6))
     }
 
-    /// Notes the newest telemetry.
-    pub fn sample(&self, sample: &TelemetrySample, _settled: bool) {
+    /// Records the newest telemetry.
+    pub fn sample(&self, sample: &TelemetrySample) {
         self.lock().sample = *sample;
     }
 
-    /// Notes how the robot link is, in words.
-    pub fn link(&self, words: &str) {
+    /// Records and logs the state of the robot link.
+    pub fn link(&self, text: &str) {
         let mut s = self.lock();
-        if s.link != words {
-            log::say(format_args!("robot link: {words}"));
-            if words.starts_with("lost") {
-                words.clone_into(&mut s.last_loss);
+        if s.link != text {
+            log::message(format_args!("robot link: {text}"));
+            if text.starts_with("lost") {
+                text.clone_into(&mut s.last_loss);
             }
-            words.clone_into(&mut s.link);
+            text.clone_into(&mut s.link);
         }
     }
 
-    /// Notes why images are being refused; empty when they are not.
-    pub fn refusal(&self, words: &str) {
-        words.clone_into(&mut self.lock().refusal);
+    /// Records why images are refused; empty when they are not.
+    pub fn refusal(&self, text: &str) {
+        text.clone_into(&mut self.lock().refusal);
     }
 
-    /// Notes robot mode and safety bits as a new session found them.
+    /// Records robot mode and safety bits at the start of a session.
     pub fn controller(&self, mode: i32, safety: u32) {
         let mut s = self.lock();
         s.controller = Some((mode, safety));
-        if safety & STOPPED == 0 {
+        if safety & SAFETY_STOPPED_BITS == 0 {
             s.stop_cause.clear();
             s.stop_kind = None;
         }
     }
 
-    /// Notes a message of the controller.
-    pub fn said(&self, said: &Said) {
+    /// Records and logs a message of the controller.
+    pub fn controller_message(&self, message: &RobotMessage) {
         let mut s = self.lock();
-        // An error says more than the change of safety mode that follows it, and both more than the program that ended by it.
-        let normal = ["normal", "reduced"].iter().any(|w| said.text.starts_with(w));
-        let stops = match (said.kind, s.stop_kind) {
-            (SaidKind::Error, _) => true,
-            (SaidKind::Safety, kind) => !normal && kind != Some(SaidKind::Error),
-            (SaidKind::Program, kind) => kind.is_none_or(|k| k == SaidKind::Program),
-            (SaidKind::Popup, _) => false,
+        // An error is more specific than the change of safety mode that follows it, and both are more specific than the
+        // end of the program.
+        let normal = ["normal", "reduced"].iter().any(|mode| message.text.starts_with(mode));
+        let stops = match (message.kind, s.stop_kind) {
+            (MessageKind::Error, _) => true,
+            (MessageKind::Safety, kind) => !normal && kind != Some(MessageKind::Error),
+            (MessageKind::Program, kind) => kind.is_none_or(|k| k == MessageKind::Program),
+            (MessageKind::Popup, _) => false,
         };
         if stops {
-            s.stop_cause.clone_from(&said.text);
-            s.stop_kind = Some(said.kind);
+            s.stop_cause.clone_from(&message.text);
+            s.stop_kind = Some(message.kind);
         }
-        if s.said.back() != Some(&said.text) {
-            log::say(format_args!("controller says: {}", said.text));
-            if s.said.len() == SAID {
-                s.said.pop_front();
+        if s.messages.back() != Some(&message.text) {
+            log::message(format_args!("controller message: {}", message.text));
+            if s.messages.len() == MAX_MESSAGES {
+                s.messages.pop_front();
             }
-            s.said.push_back(said.text.clone());
+            s.messages.push_back(message.text.clone());
         }
     }
 
-    /// A recovery begins.
-    pub fn recovering(&self) {
+    /// Records the start of a recovery.
+    pub fn recovery_started(&self) {
         {
             let r = &mut self.lock().recovery;
             *r = Recovery { number: r.number + 1, running: true, ..Recovery::default() };
@@ -182,17 +179,17 @@ impl Report {
         self.link("recovering");
     }
 
-    /// A step of it is done.
-    pub fn recover_step(&self, words: &str) {
-        log::say(format_args!("recover: {words}"));
+    /// Records and logs a completed step of it.
+    pub fn recovery_step(&self, text: &str) {
+        log::message(format_args!("recover: {text}"));
         let steps = &mut self.lock().recovery.steps;
-        if steps.len() < STEPS {
-            steps.push(words.to_owned());
+        if steps.len() < MAX_STEPS {
+            steps.push(text.to_owned());
         }
     }
 
-    /// It has ended.
-    pub fn recovered(&self, result: Result<(), String>) {
+    /// Records its end.
+    pub fn recovery_ended(&self, result: Result<(), String>) {
         match &result {
             Ok(()) => self.link("recovered; connecting"),
             Err(e) => self.link(&format!("not recovered: {e}")),
@@ -201,19 +198,19 @@ impl Report {
         (r.running, r.error) = (false, result.err());
     }
 
-    /// Notes what the host refused.
-    pub fn refused(&self, what: &[String]) {
-        for line in what {
-            log::say(format_args!("not real-time: {line}"));
+    /// Records and logs what the host refused.
+    pub fn host_refused(&self, refused: &[String]) {
+        for line in refused {
+            log::message(format_args!("not real-time: {line}"));
         }
-        self.lock().refused.extend_from_slice(what);
+        self.lock().refused.extend_from_slice(refused);
     }
 
-    /// Notes an accepted set-point.
+    /// Records an accepted set-point.
     pub fn setpoint(&self, setpoint: &SetPoint, name: String) {
         let mut s = self.lock();
         s.plan = name;
-        // Telemetry says the same a moment later; the answer to whoever sent it must not say "none" until then.
+        // Telemetry follows a moment later; the answer to the client already needs the id.
         s.sample.setpoint = setpoint.id;
         drop(s);
         let _ = self.setpoints.force_push(*setpoint);
@@ -224,9 +221,9 @@ impl Report {
         self.setpoints.pop()
     }
 
-    /// The whole state as one JSON object, with what else the caller knows. Mode and motion are the last cycle's own; nothing is formatted under
-    /// the lock.
-    pub fn json(&self, accepted: bool, reason: Option<&str>, marks: &str, live: &Live, more: Value) -> String {
+    /// The state as one JSON object, with the keys of `more` added. Mode and motion are those of the last cycle.
+    /// Nothing is formatted under the lock.
+    pub fn json(&self, accepted: bool, reason: Option<&str>, marks: &str, live: &LiveState, more: Value) -> String {
         let (_, image_age_ms) = self.images();
         let s = self.lock().clone();
         let t = &s.sample;
@@ -238,9 +235,9 @@ impl Report {
             "cause": s.cause,
             "robot": s.link,
             "robot_last_loss": s.last_loss,
-            "robot_state": controller_words(s.controller, t),
+            "robot_state": controller_text(s.controller, t),
             "stop_cause": s.stop_cause,
-            "controller_says": s.said,
+            "controller_says": s.messages,
             "recovery": json!({ "number": s.recovery.number, "running": s.recovery.running, "steps": s.recovery.steps, "error": s.recovery.error }),
             "marks": if marks.is_empty() { format!("{} left, {} right of {}", t.marks_seen[0], t.marks_seen[1], t.mark_count) } else { marks.to_owned() },
             "setpoint": if t.setpoint == 0 { String::from("none") } else { format!("{:016x}", t.setpoint) },
@@ -279,48 +276,51 @@ impl Report {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use graspd_rt::arm::ROBOT_MODE_RUNNING;
 
     fn status(report: &Report) -> Value {
-        serde_json::from_str(&report.json(true, None, "", &Live::default(), Value::Null)).unwrap()
+        serde_json::from_str(&report.json(true, None, "", &LiveState::default(), Value::Null)).unwrap()
     }
 
     #[test]
-    fn the_cause_of_a_stop_outlives_what_follows_it_and_ends_with_the_stop() {
+    fn the_cause_of_a_stop_is_kept_until_the_stop_ends() {
         let report = Report::default();
-        let say = |kind, text: &str| report.said(&Said { kind, text: text.to_owned() });
-        say(SaidKind::Program, "RTDE watchdog");
+        let receive = |kind, text: &str| report.controller_message(&RobotMessage { kind, text: text.to_owned() });
+        receive(MessageKind::Program, "RTDE watchdog");
         assert_eq!(status(&report)["stop_cause"], "RTDE watchdog");
-        say(SaidKind::Safety, "protective stop (C153A2)");
+        receive(MessageKind::Safety, "protective stop (C153A2)");
         assert_eq!(status(&report)["stop_cause"], "protective stop (C153A2)");
-        say(SaidKind::Error, "C153A2 joint 2 left its path");
-        for (kind, text) in
-            [(SaidKind::Safety, "protective stop (C153A2)"), (SaidKind::Popup, "x: y"), (SaidKind::Safety, "normal")]
-        {
-            say(kind, text);
+        receive(MessageKind::Error, "C153A2 joint 2 left its path");
+        for (kind, text) in [
+            (MessageKind::Safety, "protective stop (C153A2)"),
+            (MessageKind::Popup, "x: y"),
+            (MessageKind::Safety, "normal"),
+        ] {
+            receive(kind, text);
             assert_eq!(status(&report)["stop_cause"], "C153A2 joint 2 left its path");
         }
-        report.controller(7, 0b100);
+        report.controller(ROBOT_MODE_RUNNING, 0b100);
         assert_eq!(status(&report)["stop_cause"], "C153A2 joint 2 left its path");
         assert_eq!(status(&report)["robot_state"], "running, safety protective stop");
-        report.controller(7, 1);
+        report.controller(ROBOT_MODE_RUNNING, 1);
         assert_eq!(status(&report)["stop_cause"], "");
         assert_eq!(status(&report)["controller_says"].as_array().map(Vec::len), Some(6));
     }
 
     #[test]
-    fn a_recovery_is_numbered_told_and_ended() {
+    fn a_recovery_has_a_number_steps_and_an_end() {
         let report = Report::default();
-        report.recovering();
-        report.recover_step("power on: Powering on");
+        report.recovery_started();
+        report.recovery_step("power on: Powering on");
         assert_eq!(status(&report)["recovery"]["running"], true);
-        report.recovered(Err("brakes".to_owned()));
+        report.recovery_ended(Err("brakes".to_owned()));
         let s = status(&report);
         assert_eq!((&s["recovery"]["number"], &s["recovery"]["error"]), (&json!(1), &json!("brakes")));
         assert_eq!(
             (&s["recovery"]["steps"][0], &s["robot"]),
             (&json!("power on: Powering on"), &json!("not recovered: brakes"))
         );
-        report.recovering();
+        report.recovery_started();
         assert_eq!(status(&report)["recovery"]["steps"], json!([]));
     }
 }

@@ -1,9 +1,9 @@
-//! Latency percentiles, recorded outside the loop from what the loop noted.
+//! Latency percentiles, computed outside the command cycle from its records.
 
 use graspd_shm::control::Percentiles;
 use hdrhistogram::Histogram;
 
-/// One latency: a histogram of nanoseconds up to ten seconds, three digits.
+/// One latency: a histogram from 1 ns to 10 s with three significant digits.
 #[derive(Debug)]
 pub struct Latency {
     histogram: Histogram<u64>,
@@ -11,7 +11,7 @@ pub struct Latency {
 
 impl Default for Latency {
     fn default() -> Self {
-        // 1 ns .. 10 s at three digits is always a valid pair of bounds; the fallback is the library's own auto-resizing one.
+        // These bounds are always valid; the fallback is the library's auto-resizing histogram.
         let histogram = Histogram::new_with_bounds(1, 10_000_000_000, 3)
             .or_else(|_| Histogram::new(3))
             .unwrap_or_else(|_| unreachable!("three significant digits are always valid"));
@@ -20,17 +20,17 @@ impl Default for Latency {
 }
 
 impl Latency {
-    /// Notes one value.
-    pub fn note(&mut self, ns: u64) {
+    /// Records one value, ns.
+    pub fn record(&mut self, ns: u64) {
         self.histogram.saturating_record(ns.max(1));
     }
 
-    /// Forgets everything.
+    /// Removes all values.
     pub fn clear(&mut self) {
         self.histogram.reset();
     }
 
-    /// Percentiles in microseconds; zeroes before the first value.
+    /// Percentiles, µs; zero before the first value.
     pub fn percentiles(&self) -> Percentiles {
         let us = |ns: u64| ns as f32 / 1000.0;
         if self.histogram.is_empty() {

@@ -1,4 +1,5 @@
-//! A wire that harms: stands between a client and a controller, forwards, and breaks each RTDE connection in its own way.
+//! A hostile connection: a proxy between client and controller that forwards data and breaks each RTDE connection in
+//! one of several ways.
 
 use graspd_rt::rtde::Framer;
 use std::collections::BTreeMap;
@@ -8,31 +9,31 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-/// What happens to a connection.
+/// How a connection is broken.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Harm {
-    /// Reset before a word.
+    /// Reset before any data.
     Refuse,
-    /// Nothing is ever answered.
+    /// No answer.
     Silence,
-    /// Reset after so many bytes to the client.
+    /// Reset after this many bytes to the client.
     Reset(usize),
-    /// Closed after so many bytes.
+    /// Closed after this many bytes.
     Close(usize),
-    /// A size that lies, after so many bytes.
-    Lie(usize),
-    /// Noise after so many bytes.
+    /// A wrong package size after this many bytes.
+    WrongSize(usize),
+    /// Noise after this many bytes.
     Noise(usize),
-    /// One byte a write, then a reset.
+    /// One byte in each write, then a reset.
     Bytes,
-    /// A byte now and then.
-    Drip,
-    /// The client is never read.
-    Deaf,
+    /// A byte every 15 ms.
+    SlowBytes,
+    /// Data from the client is never read.
+    NeverReads,
     /// Inputs are answered with IN_USE.
     InUse,
-    /// Forwarded faithfully for so long, then a reset.
-    Faithful(Duration),
+    /// Forwarded unchanged for this long, then a reset.
+    Forward(Duration),
 }
 
 #[derive(Default)]
@@ -45,14 +46,14 @@ struct Counts {
     kinds: Mutex<BTreeMap<String, usize>>,
 }
 
-/// The wires of one controller.
-pub(crate) struct Wires {
-    /// Where the client finds them, with the robot's own port numbers.
+/// The proxy of one controller.
+pub(crate) struct Proxy {
+    /// Address for the client; the ports are the robot's.
     pub(crate) address: IpAddr,
     counts: Arc<Counts>,
 }
 
-impl Wires {
+impl Proxy {
     pub(crate) fn start(controller: IpAddr, seed: u64) -> Self {
         let id = std::process::id();
         let address = IpAddr::V4(Ipv4Addr::new(127, 40, (id >> 8) as u8, (id as u8).max(1)));
@@ -75,13 +76,13 @@ impl Wires {
                         *counts.kinds.lock().unwrap().entry(name).or_default() += 1;
                         harm
                     } else {
-                        Harm::Faithful(Duration::from_secs(3600))
+                        Harm::Forward(Duration::from_secs(3600))
                     };
                     let counts = Arc::clone(&counts);
                     counts.open.fetch_add(1, Ordering::Relaxed);
                     std::thread::spawn(move || {
                         if let Ok(server) = TcpStream::connect((controller, port)) {
-                            let _ = carry(&client, &server, harm, port == 30_004, &counts);
+                            let _ = forward(&client, &server, harm, port == 30_004, &counts);
                         }
                         if !matches!(harm, Harm::Close(_)) {
                             let _ = rustix::net::sockopt::set_socket_linger(&client, Some(Duration::ZERO));
@@ -100,11 +101,12 @@ impl Wires {
         self.counts.connections.load(Ordering::Relaxed)
     }
 
-    /// Commands that clients sent, and those among them with another mode word than idle.
+    /// Number of commands from clients.
     pub(crate) fn commands(&self) -> usize {
         self.counts.commands.load(Ordering::Relaxed)
     }
 
+    /// Number of commands with a mode other than idle.
     pub(crate) fn commands_to_move(&self) -> usize {
         self.counts.moving.load(Ordering::Relaxed)
     }
@@ -113,7 +115,7 @@ impl Wires {
         self.counts.kinds.lock().unwrap().clone()
     }
 
-    /// Waits until what the client has closed is closed here as well.
+    /// Waits until the connections that the client has closed are closed here as well.
     pub(crate) fn settle(&self) {
         let start = Instant::now();
         while self.counts.open.load(Ordering::Relaxed) > 1 && start.elapsed() < Duration::from_secs(5) {
@@ -122,7 +124,7 @@ impl Wires {
     }
 }
 
-impl Drop for Wires {
+impl Drop for Proxy {
     fn drop(&mut self) {
         self.counts.stop.store(true, Ordering::Relaxed);
     }
@@ -140,17 +142,17 @@ fn draw(random: &mut u64) -> Harm {
         1 => Harm::Silence,
         2..=4 => Harm::Reset(at),
         5 | 6 => Harm::Close(at),
-        7 | 8 => Harm::Lie(at),
+        7 | 8 => Harm::WrongSize(at),
         9 => Harm::Noise(at),
         10 => Harm::Bytes,
-        11 => Harm::Drip,
-        12 => Harm::Deaf,
+        11 => Harm::SlowBytes,
+        12 => Harm::NeverReads,
         13 => Harm::InUse,
-        _ => Harm::Faithful(Duration::from_millis(500 + next(700))),
+        _ => Harm::Forward(Duration::from_millis(500 + next(700))),
     }
 }
 
-/// Bytes that are there, or `None` when the other side has ended.
+/// Number of bytes read without waiting; `None` when the connection has ended.
 fn take(stream: &mut &TcpStream, buffer: &mut [u8]) -> Option<usize> {
     match stream.read(buffer) {
         Ok(0) => None,
@@ -160,7 +162,7 @@ fn take(stream: &mut &TcpStream, buffer: &mut [u8]) -> Option<usize> {
     }
 }
 
-/// Writes all, for at most a second.
+/// Writes all bytes, for at most a second.
 fn put(mut stream: &TcpStream, mut bytes: &[u8]) -> Option<()> {
     let start = Instant::now();
     while !bytes.is_empty() {
@@ -175,24 +177,24 @@ fn put(mut stream: &TcpStream, mut bytes: &[u8]) -> Option<()> {
     Some(())
 }
 
-/// Carries one connection to its end, which is `None`.
-fn carry(client: &TcpStream, server: &TcpStream, harm: Harm, rtde: bool, counts: &Counts) -> Option<()> {
+/// Forwards one connection until it ends.
+fn forward(client: &TcpStream, server: &TcpStream, harm: Harm, rtde: bool, counts: &Counts) -> Option<()> {
     for s in [client, server] {
         s.set_nodelay(true).ok()?;
         s.set_nonblocking(true).ok()?;
     }
     let (start, mut buffer, mut down) = (Instant::now(), vec![0u8; 8192], 0usize);
     let (mut up, mut answers) = (Framer::new(vec![0u8; 1 << 16]), Framer::new(vec![0u8; 1 << 16]));
-    // No kind of harm lasts longer than this; the client's patience is shorter.
-    let longest = match harm {
+    // Maximum duration; the client's timeout is shorter.
+    let max_duration = match harm {
         Harm::Refuse => return None,
-        Harm::Faithful(d) => d,
-        Harm::Bytes | Harm::Deaf => Duration::from_millis(900),
+        Harm::Forward(d) => d,
+        Harm::Bytes | Harm::NeverReads => Duration::from_millis(900),
         _ => Duration::from_secs(3),
     };
-    while start.elapsed() < longest && !counts.stop.load(Ordering::Relaxed) {
+    while start.elapsed() < max_duration && !counts.stop.load(Ordering::Relaxed) {
         std::thread::sleep(Duration::from_millis(1));
-        let n = if harm == Harm::Deaf && down > 800 { 0 } else { take(&mut &*client, &mut buffer)? };
+        let n = if harm == Harm::NeverReads && down > 800 { 0 } else { take(&mut &*client, &mut buffer)? };
         let sent = buffer.get(..n)?.to_vec();
         if rtde {
             count_commands(&mut up, &sent, counts);
@@ -206,19 +208,19 @@ fn carry(client: &TcpStream, server: &TcpStream, harm: Harm, rtde: bool, counts:
         if harm == Harm::InUse {
             bytes = refuse_inputs(&mut answers, &bytes);
         }
-        // Where among these bytes the harm is done, if among these.
-        let place = match harm {
-            Harm::Reset(at) | Harm::Close(at) | Harm::Lie(at) | Harm::Noise(at) => {
+        // Index among these bytes at which the connection is broken.
+        let index = match harm {
+            Harm::Reset(at) | Harm::Close(at) | Harm::WrongSize(at) | Harm::Noise(at) => {
                 at.checked_sub(down).filter(|left| *left < bytes.len())
             }
             _ => None,
         };
-        match (harm, place) {
+        match (harm, index) {
             (Harm::Reset(_) | Harm::Close(_), Some(at)) => {
                 put(client, bytes.get(..at)?);
                 return None;
             }
-            (Harm::Lie(_), Some(at)) => drop(bytes.splice(at..at, [0, 1, 0xff, 0xff])),
+            (Harm::WrongSize(_), Some(at)) => drop(bytes.splice(at..at, [0, 1, 0xff, 0xff])),
             (Harm::Noise(_), Some(at)) => {
                 let noise = (0..200u32).map(|k| (k.wrapping_mul(2_654_435_761) >> 13) as u8);
                 drop(bytes.splice(at..at, noise));
@@ -228,11 +230,11 @@ fn carry(client: &TcpStream, server: &TcpStream, harm: Harm, rtde: bool, counts:
         down += bytes.len();
         match harm {
             Harm::Bytes => bytes.chunks(1).try_for_each(|b| put(client, b))?,
-            Harm::Drip => {
+            Harm::SlowBytes => {
                 for b in bytes.chunks(1) {
                     put(client, b)?;
                     std::thread::sleep(Duration::from_millis(15));
-                    if start.elapsed() > longest {
+                    if start.elapsed() > max_duration {
                         return None;
                     }
                 }
@@ -260,7 +262,7 @@ fn count_commands(framer: &mut Framer<Vec<u8>>, mut bytes: &[u8], counts: &Count
     }
 }
 
-/// The answer to the input recipe says that another client holds the first one.
+/// Replaces the answer to the input recipe: another client holds the first variable.
 fn refuse_inputs(framer: &mut Framer<Vec<u8>>, mut bytes: &[u8]) -> Vec<u8> {
     let mut out = Vec::new();
     while !bytes.is_empty() {

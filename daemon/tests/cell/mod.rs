@@ -1,5 +1,5 @@
-//! A simulated cell of processes for tests: a world on disk, a plan for it, and mock controller, scene and daemon as processes.
-#![allow(dead_code)] // every test uses its own part of it
+//! A simulated cell for tests: a world on disk, a plan for it, and mock controller, scene and daemon as processes.
+#![allow(dead_code)] // no test uses all of it
 
 use graspd_calib::commands::Class;
 use graspd_calib::commands::plan::{PlanRequest, run};
@@ -30,12 +30,12 @@ impl Process {
             .unwrap();
         let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
         let ready = loop {
-            let line = lines.next().expect("ended before it was ready").unwrap();
+            let line = lines.next().expect("the process ended before it was ready").unwrap();
             if let Ok(v @ Value::Object(_)) = serde_json::from_str(&line) {
                 break v;
             }
         };
-        // Whatever else it says is read, so that it never blocks on a full pipe.
+        // The rest of the output is read, so that the process never blocks on a full pipe.
         std::thread::spawn(move || lines.for_each(drop));
         Self { child, ready }
     }
@@ -63,7 +63,7 @@ impl Drop for Process {
     }
 }
 
-/// What makes a cell other than the usual one.
+/// Deviations from the default cell.
 #[derive(Clone, Debug)]
 pub(crate) struct Extra {
     /// Stereo pairs a second.
@@ -82,7 +82,7 @@ impl Default for Extra {
     }
 }
 
-/// A world, its plan and its daemon's configuration, in a folder of its own.
+/// A folder with a world, its plan and its daemon's configuration.
 pub(crate) struct World {
     pub(crate) folder: PathBuf,
     pub(crate) address: String,
@@ -105,7 +105,7 @@ impl World {
         for (view, name) in [(View::Left, "left.png"), (View::Right, "right.png")] {
             renderer.image(view, &shot).save(folder.join(name)).unwrap();
         }
-        let click = |eye: usize| Some(format!("{:.1},{:.1}", scenario.clicks[eye].x, scenario.clicks[eye].y));
+        let click = |view: usize| Some(format!("{:.1},{:.1}", scenario.clicks[view].x, scenario.clicks[view].y));
         let done = run(&PlanRequest {
             left: folder.join("left.png"),
             right: folder.join("right.png"),
@@ -117,7 +117,7 @@ impl World {
             ..PlanRequest::default()
         });
         assert_eq!(done.class, Class::Done, "{}", done.text);
-        // A loopback address of its own: no port of another test, nor of an outgoing connection, can be in the way.
+        // A separate loopback address: its ports are not used by other tests or by outgoing connections.
         let id = std::process::id() + 131 * seed as u32;
         let address = format!("127.{}.{}.{}", 16 + id / (254 * 254) % 40, 1 + id / 254 % 254, 1 + id % 254);
         let joints = scenario.start.map(|q| format!("{q:.9}")).join(",");
@@ -156,7 +156,7 @@ impl World {
         Process::start(&["run", "--config", &self.path("graspd.toml")], &self.folder.join("graspd.log"))
     }
 
-    /// A verb through the command line; whether it was accepted, and what was said.
+    /// Runs a verb on the command line; returns whether it was accepted, and the answer.
     pub(crate) fn verb(&self, verb: &[&str]) -> (bool, Value) {
         let config = self.path("graspd.toml");
         let out = Command::new(env!("CARGO_BIN_EXE_graspd"))
@@ -170,17 +170,17 @@ impl World {
     pub(crate) fn insist(&self, verb: &[&str]) {
         let until = Instant::now() + Duration::from_secs(40);
         loop {
-            let (accepted, said) = self.verb(verb);
+            let (accepted, answer) = self.verb(verb);
             if accepted {
                 return;
             }
             let log = std::fs::read_to_string(self.folder.join("graspd.log")).unwrap_or_default();
-            assert!(Instant::now() < until, "{verb:?} is refused: {said}\n{log}");
+            assert!(Instant::now() < until, "{verb:?} is refused: {answer}\n{log}");
             std::thread::sleep(Duration::from_millis(100));
         }
     }
 
-    /// Clears a fault. A host that stalls may have ended the control script meanwhile; then the robot is recovered first.
+    /// Clears a fault. If a stall of the host has ended the control script, the robot is recovered first.
     pub(crate) fn clear(&self) {
         let until = Instant::now() + Duration::from_secs(60);
         while !self.verb(&["reset"]).0 {
@@ -190,29 +190,29 @@ impl World {
     }
 
     pub(crate) fn state(&self) -> (String, String) {
-        let (_, said) = self.verb(&["status"]);
-        let text = |key: &str| said.get(key).and_then(Value::as_str).unwrap_or("").to_owned();
+        let (_, status) = self.verb(&["status"]);
+        let text = |key: &str| status.get(key).and_then(Value::as_str).unwrap_or("").to_owned();
         (text("state"), text("cause"))
     }
 
-    /// Plan in, armed, moving for `after`. A host that stalls may end the control script before the arm has moved; then, as an
-    /// operator would: recover, reset, and from the start.
+    /// Sends the plan, arms, servoes and returns after `after`. If a stall of the host ends the control script before
+    /// the arm has moved, the robot is recovered, the fault is reset, and the sequence is repeated.
     pub(crate) fn servo(&self, after: Duration) {
         let plan = self.path("plan.toml");
         let until = Instant::now() + Duration::from_secs(120);
         'again: loop {
-            let begun = Instant::now();
+            let started = Instant::now();
             for verb in [&["setpoint", &plan][..], &["arm"], &["servo"]] {
                 loop {
-                    let (accepted, said) = self.verb(verb);
+                    let (accepted, answer) = self.verb(verb);
                     if accepted {
                         break;
                     }
                     let log = || std::fs::read_to_string(self.folder.join("graspd.log")).unwrap_or_default();
-                    assert!(Instant::now() < until, "{verb:?} is refused: {said}\n{}", log());
+                    assert!(Instant::now() < until, "{verb:?} is refused: {answer}\n{}", log());
                     std::thread::sleep(Duration::from_millis(100));
-                    let fault = said.get("state").and_then(Value::as_str) == Some("fault");
-                    if fault || begun.elapsed() > Duration::from_secs(15) {
+                    let fault = answer.get("state").and_then(Value::as_str) == Some("fault");
+                    if fault || started.elapsed() > Duration::from_secs(15) {
                         self.verb(&["recover"]);
                         self.verb(&["reset"]);
                         continue 'again;
@@ -224,18 +224,18 @@ impl World {
         std::thread::sleep(after);
     }
 
-    /// What the daemon has logged.
+    /// The daemon's log.
     pub(crate) fn log(&self) -> String {
         std::fs::read_to_string(self.folder.join("graspd.log")).unwrap_or_default()
     }
 
-    /// Waits for a fault or a hold and returns its words.
+    /// Waits for a fault or a hold and returns the log.
     pub(crate) fn stopped(&self) -> String {
         let until = Instant::now() + Duration::from_secs(10);
         loop {
             let (state, cause) = self.state();
             if state == "fault" || (state == "armed" && cause.starts_with("H-")) {
-                // The log is written by a thread of its own, a little behind the state.
+                // A separate thread writes the log, a little later than the state changes.
                 let log = std::fs::read_to_string(self.folder.join("graspd.log")).unwrap();
                 let last = log.lines().rfind(|l| l.contains(" -> ")).unwrap_or_default();
                 if last.contains(&format!(" -> {state}")) {
@@ -248,10 +248,10 @@ impl World {
     }
 }
 
-/// Asks mock or scene through its control port.
-pub(crate) fn ask(part: &Process, line: &str) -> Value {
-    let port = ["control", "control_port"].iter().find_map(|k| part.ready[*k].as_u64()).unwrap() as u16;
-    let host = part.ready["address"].as_str().unwrap_or("127.0.0.1");
+/// Sends a line to the control port of mock or scene and returns the answer.
+pub(crate) fn ask(process: &Process, line: &str) -> Value {
+    let port = ["control", "control_port"].iter().find_map(|k| process.ready[*k].as_u64()).unwrap() as u16;
+    let host = process.ready["address"].as_str().unwrap_or("127.0.0.1");
     let mut stream = TcpStream::connect((host, port)).unwrap();
     stream.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
     writeln!(stream, "{line}").unwrap();
@@ -260,7 +260,7 @@ pub(crate) fn ask(part: &Process, line: &str) -> Value {
     serde_json::from_str(&answer).unwrap()
 }
 
-/// The oracle's summary, wherever the answer carries it.
+/// The mock's summary of the wire, from wherever the answer has it.
 pub(crate) fn summary(mock: &Process) -> Value {
     let v = ask(mock, r#"{"cmd":"summary"}"#);
     ["/summary", "/answer", "/result", ""]

@@ -1,10 +1,10 @@
-//! Stops measured by the mock's wire record, and streams that a log can be stuck on.
-#![allow(dead_code)] // every test uses its own part of it
+//! Stops measured in the mock's wire record, and streams that block a log.
+#![allow(dead_code)] // no test uses all of it
 
 use super::wire::{Entry, Wire};
 use super::{Extra, Process, World, ask, summary};
 use graspd::realtime::now_ns;
-use graspd::stop::{Heard, ask as ask_to_stop};
+use graspd::stop::{StopAnswer, ask as request_stop};
 use graspd_shm::control::{RequestClient, Verb};
 use graspd_shm::{Names, create_node};
 use rustix::process::Signal;
@@ -15,41 +15,40 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// From asking to the first set-point that slows down, ms (O09).
-pub(crate) const BOUND_MS: f64 = 20.0;
-/// Cycles of the daemon come every 2 ms; a longer pause between two of them, ms, is a deadline that its cycle missed.
-pub(crate) const MISSED_MS: f64 = 4.5;
-/// Slower than this is no motion to stop, rad/s.
-const MOVING: f64 = 0.02;
+/// Maximum time from the request to the first decelerating set-point, ms.
+pub(crate) const MAX_LATENCY_MS: f64 = 20.0;
+/// Maximum time between two set-points without a missed deadline, ms; the daemon's period is 2 ms.
+pub(crate) const MAX_PAUSE_MS: f64 = 4.5;
+/// Minimum speed of a motion to stop, rad/s.
+const MIN_SPEED: f64 = 0.02;
 
-/// One stop by the wire record.
+/// One stop, by the wire record.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Stop {
-    /// From asking to the first decelerating set-point, ms.
+    /// Time from the request to the first decelerating set-point, ms.
     pub(crate) latency_ms: f64,
-    /// Longest pause between two set-points meanwhile, ms.
+    /// Maximum time between two set-points meanwhile, ms.
     pub(crate) pause_ms: f64,
-    /// Fastest joint before it, rad/s.
+    /// Speed of the fastest joint before it, rad/s.
     pub(crate) speed: f64,
-    /// From the first decelerating set-point to rest, ms.
+    /// Time from the first decelerating set-point to rest, ms.
     pub(crate) ramp_ms: f64,
 }
 
 impl Stop {
-    /// Whether the daemon's cycle itself missed a deadline meanwhile.
+    /// Whether the daemon's cycle missed a deadline meanwhile.
     pub(crate) fn missed(&self) -> bool {
-        self.pause_ms > MISSED_MS
+        self.pause_ms > MAX_PAUSE_MS
     }
 
-    /// Holds one stop against the bound; one in which the host stalled the cycle is held against the bound and that
-    /// stall.
+    /// Compares the latency with its bound, which grows by the pause when the host stalled the cycle.
     pub(crate) fn check(&self, what: &str) {
         let stalled = if self.missed() { " (the host stalled the cycle)" } else { "" };
         println!(
             "{what:<34} {:.3} rad/s, first decelerating after {:.1} ms, rest {:.0} ms later, longest pause {:.1} ms{stalled}",
             self.speed, self.latency_ms, self.ramp_ms, self.pause_ms
         );
-        let allowed = BOUND_MS + if self.missed() { self.pause_ms } else { 0.0 };
+        let allowed = MAX_LATENCY_MS + if self.missed() { self.pause_ms } else { 0.0 };
         assert!(self.latency_ms <= allowed, "{what}: {self:?}");
     }
 }
@@ -58,7 +57,7 @@ fn norm(v: &[f64; 6]) -> f64 {
     v.iter().map(|x| x * x).sum::<f64>().sqrt()
 }
 
-/// The stop ramp shrinks all rates alike: parallel to the ones before, and smaller. The law's set-points change their
+/// Whether the rates are parallel to the previous ones and smaller, as on a stop ramp. The control law changes their
 /// direction.
 fn shrinks(from: &[f64; 6], to: &[f64; 6]) -> bool {
     let (a, b) = (norm(from), norm(to));
@@ -66,7 +65,8 @@ fn shrinks(from: &[f64; 6], to: &[f64; 6]) -> bool {
     b < a && off <= 1e-9 * a
 }
 
-/// Judges the last stop in `entries`; in words why there is none to judge.
+/// Measures the last stop in `entries`. An error that begins with a capital letter is a failure; any other says that
+/// the arm was not in motion.
 pub(crate) fn judge(entries: &[Entry], asked_ns: u64) -> Result<Stop, String> {
     let sent: Vec<(u64, [f64; 6])> = entries
         .iter()
@@ -86,10 +86,10 @@ pub(crate) fn judge(entries: &[Entry], asked_ns: u64) -> Result<Stop, String> {
     let (at, before) = (sent[first].0, &sent[first - 1].1);
     let speed = before.iter().fold(0.0f64, |m, r| m.max(r.abs()));
     if at <= asked_ns {
-        return Err("it was being stopped already".to_owned());
+        return Err("it was already stopping".to_owned());
     }
-    if speed < MOVING {
-        return Err(format!("the arm stood still or crept: {speed:.4} rad/s"));
+    if speed < MIN_SPEED {
+        return Err(format!("the arm was at rest or slow: {speed:.4} rad/s"));
     }
     let ms = |a: u64, b: u64| b.saturating_sub(a) as f64 * 1e-6;
     let from = sent.iter().rposition(|s| s.0 <= asked_ns).unwrap_or(0);
@@ -97,7 +97,7 @@ pub(crate) fn judge(entries: &[Entry], asked_ns: u64) -> Result<Stop, String> {
     Ok(Stop { latency_ms: ms(asked_ns, at), pause_ms, speed, ramp_ms: ms(at, sent[last + 1].0) })
 }
 
-/// A world with controller and cameras, and the controller's record.
+/// A world with controller and cameras, and the controller's wire record.
 pub(crate) struct Cell {
     pub(crate) world: World,
     pub(crate) mock: Process,
@@ -117,9 +117,9 @@ impl Cell {
         Names::new(self.world.folder.join("shm"), &Names::default_prefix(), "kill").unwrap()
     }
 
-    /// From the start of the way, moving for `after`; what was recorded until then is forgotten.
+    /// Starts a motion, returns after `after`, and discards the record until then.
     pub(crate) fn drive(&mut self, after: Duration) {
-        // An arm that is put elsewhere while it moves would be a fault.
+        // Teleporting a moving arm would be a fault.
         self.world.verb(&["stop"]);
         std::thread::sleep(Duration::from_millis(200));
         ask(&self.mock, &format!(r#"{{"cmd":"teleport","q":[{}]}}"#, self.world.joints));
@@ -128,7 +128,7 @@ impl Cell {
         self.wire.read();
     }
 
-    /// Drives, does `act`, and judges what follows; an instant without motion is passed over.
+    /// Starts a motion, calls `act`, and measures the stop. Repeats when the arm was not in motion.
     pub(crate) fn stop(&mut self, act: &mut dyn FnMut(&Self)) -> (Stop, Vec<Entry>) {
         for _ in 0..8 {
             self.drive(Duration::from_millis(500));
@@ -140,15 +140,15 @@ impl Cell {
                 Ok(stop) => return (stop, entries),
                 Err(e) => {
                     assert!(!e.starts_with(char::is_uppercase), "{e}\n{}", self.world.log());
-                    println!("passed over: {e}");
+                    println!("skipped: {e}");
                     self.world.verb(&["stop"]);
                 }
             }
         }
-        panic!("eight times no motion to stop\n{}", self.world.log());
+        panic!("no motion to stop in eight attempts\n{}", self.world.log());
     }
 
-    /// The mock's oracle has seen no limit broken.
+    /// The mock has recorded no limit violation.
     pub(crate) fn check_limits(&self) {
         let seen = summary(&self.mock);
         assert_eq!(seen["limit_violations"], 0, "{}", seen["violations"]);
@@ -161,7 +161,7 @@ impl Cell {
     }
 }
 
-/// A daemon whose standard output and error go where the test wants them; ready when it answers.
+/// Starts a daemon with these streams and waits until it answers.
 pub(crate) fn daemon_on(world: &World, out: Stdio, err: Stdio) -> Process {
     let child = Command::new(env!("CARGO_BIN_EXE_graspd"))
         .args(["run", "--config", &world.path("graspd.toml")])
@@ -179,7 +179,7 @@ pub(crate) fn daemon_on(world: &World, out: Stdio, err: Stdio) -> Process {
     process
 }
 
-/// The end of a pipe that takes no byte more, and its other end, to be kept and not read: a terminal after Ctrl-S.
+/// The write end of a full pipe, and its read end, to be kept and not read: like a terminal after Ctrl-S.
 pub(crate) fn full_pipe() -> (Stdio, PipeReader) {
     let (reader, mut writer) = std::io::pipe().unwrap();
     rustix::io::ioctl_fionbio(&writer, true).unwrap();
@@ -190,25 +190,25 @@ pub(crate) fn full_pipe() -> (Stdio, PipeReader) {
     (Stdio::from(writer), reader)
 }
 
-/// A pipe whose reader is gone: `| head`.
+/// A pipe without a reader, as after `| head`.
 pub(crate) fn closed_pipe() -> Stdio {
     Stdio::from(std::io::pipe().unwrap().1)
 }
 
-/// A disk without room.
+/// A full disk.
 pub(crate) fn full_disk() -> Stdio {
     Stdio::from(std::fs::File::options().write(true).open("/dev/full").unwrap())
 }
 
-/// A stop by the socket, which must have been taken.
+/// A stop by the socket, which must answer.
 pub(crate) fn by_socket(names: &Names) {
-    match ask_to_stop(names) {
-        Heard::Socket { .. } => {}
+    match request_stop(names) {
+        StopAnswer::Socket { .. } => {}
         other => panic!("{other:?}"),
     }
 }
 
-/// Waits for the end of a process, at most so long; its exit code, `None` after a signal.
+/// Waits for the end of a process; returns its exit code, `None` after a signal.
 pub(crate) fn ended(process: &mut Process, limit: Duration) -> Option<i32> {
     let until = Instant::now() + limit;
     loop {
@@ -220,8 +220,8 @@ pub(crate) fn ended(process: &mut Process, limit: Duration) -> Option<i32> {
     }
 }
 
-/// Ends a daemon by a signal out of motion: it ramps down, leaves nothing to the controller's watchdog, and ends with
-/// code 0.
+/// Ends a daemon by a signal during motion: it ramps down, ends the script without the controller's watchdog, and exits
+/// with code 0.
 pub(crate) fn end_by(cell: &mut Cell, daemon: &mut Process, signal: Signal, what: &str) {
     let (stop, entries) = cell.stop(&mut |_| daemon.signal(signal));
     stop.check(what);
@@ -229,25 +229,25 @@ pub(crate) fn end_by(cell: &mut Cell, daemon: &mut Process, signal: Signal, what
     let mut notes = entries;
     notes.extend(cell.wire.read());
     let watchdog = notes.iter().find(|e| matches!(e, Entry::Note(n) if n.to_lowercase().contains("watchdog")));
-    assert_eq!(watchdog, None, "{what}: the end was left to the watchdog");
+    assert_eq!(watchdog, None, "{what}: the watchdog ended the script");
 }
 
-/// A stop by the verb over shared memory, of a client that is there already.
+/// A stop by the verb over shared memory, from a connected client.
 pub(crate) fn by_verb_of(client: &RequestClient) {
     assert!(client.ask(Verb::Stop, b"", now_ns(), Duration::from_secs(2)).unwrap().accepted);
 }
 
-/// Programs that ask for the status without rest.
+/// Clients that request the status continuously.
 pub(crate) struct Load {
     end: Arc<AtomicBool>,
     answered: Arc<AtomicU64>,
-    begun: Instant,
+    started: Instant,
 }
 
 impl Load {
-    /// Four clients that together ask `per_second` times.
+    /// Starts four clients that together send `per_second` requests a second.
     pub(crate) fn start<'scope>(scope: &'scope std::thread::Scope<'scope, '_>, names: &Names, per_second: u32) -> Self {
-        let load = Self { end: Arc::default(), answered: Arc::default(), begun: Instant::now() };
+        let load = Self { end: Arc::default(), answered: Arc::default(), started: Instant::now() };
         for _ in 0..4 {
             let (end, answered, names) = (Arc::clone(&load.end), Arc::clone(&load.answered), names.clone());
             scope.spawn(move || {
@@ -261,7 +261,7 @@ impl Load {
                         answered.fetch_add(1, Ordering::Relaxed);
                     }
                     std::thread::sleep(next.saturating_duration_since(Instant::now()));
-                    // What a stalled host has missed is not caught up with.
+                    // Requests missed in a stall of the host are not made up.
                     next = next.max(Instant::now() - period);
                 }
             });
@@ -269,10 +269,10 @@ impl Load {
         load
     }
 
-    /// Ends it; requests answered a second.
+    /// Ends the clients; returns the number of answers a second.
     pub(crate) fn end(self) -> f64 {
         self.end.store(true, Ordering::Relaxed);
-        self.answered.load(Ordering::Relaxed) as f64 / self.begun.elapsed().as_secs_f64()
+        self.answered.load(Ordering::Relaxed) as f64 / self.started.elapsed().as_secs_f64()
     }
 }
 

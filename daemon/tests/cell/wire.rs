@@ -1,22 +1,24 @@
-//! The mock's wire record, read on while it grows: what was asked of the arm and what the arm did, in the order in which the mock
-//! took them. Times are the controller's own: a host that stalls the mock stalls its clock with it.
+//! Reader of the mock's wire record while it grows: the commands and the arm's motion in the order in which the mock
+//! processed them. Controller times are the mock's clock, which stalls together with the mock.
 
 use graspd_rt::rtde::Field;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::PathBuf;
 
-/// One entry of interest.
+/// One entry of the record.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Entry {
-    /// A command with this heartbeat, mode word and rates (rad/s), and when the mock received it (ns of CLOCK_MONOTONIC).
+    /// A command with this heartbeat, mode word and rates (rad/s), and when the mock received it (ns of
+    /// CLOCK_MONOTONIC).
     Heartbeat { heartbeat: i32, mode: i32, at_ns: u64, rates: [f64; 6] },
-    /// A control step: controller time, fastest target and true joint speed (rad/s), and when the mock took it (ns).
+    /// A control step: controller time, target speed and true speed of the fastest joint (rad/s), and when the mock
+    /// made it (ns).
     Step { clock_s: f64, target: f64, speed: f64, at_ns: u64 },
-    /// An event in words.
+    /// An event, as text.
     Note(String),
 }
 
-/// A reader that remembers where it was.
+/// A reader that keeps its position.
 pub(crate) struct Wire {
     path: PathBuf,
     at: u64,
@@ -28,7 +30,7 @@ impl Wire {
         Self { path, at: 8, rest: Vec::new() }
     }
 
-    /// Everything that came since the last call.
+    /// The entries since the last call.
     pub(crate) fn read(&mut self) -> Vec<Entry> {
         let mut file = std::fs::File::open(&self.path).unwrap();
         file.seek(SeekFrom::Start(self.at)).unwrap();
@@ -51,7 +53,7 @@ fn fastest(b: &[u8], i: usize) -> f64 {
     (0..6).fold(0.0, |m: f64, k| m.max(f64_at(b, i + 8 * k).abs()))
 }
 
-/// The first record and its length; `None` while it is not whole.
+/// The first entry and its length; `None` while it is incomplete.
 fn parse(b: &[u8]) -> Option<(Option<Entry>, usize)> {
     match *b.first()? {
         b'I' => input(b),
@@ -68,7 +70,7 @@ fn parse(b: &[u8]) -> Option<(Option<Entry>, usize)> {
             let text = String::from_utf8_lossy(b.get(11..n)?).into_owned();
             Some((Some(Entry::Note(text)), n))
         }
-        other => panic!("the wire record has no records of kind {other}"),
+        other => panic!("unknown entry kind {other} in the wire record"),
     }
 }
 
@@ -82,12 +84,12 @@ fn input(b: &[u8]) -> Option<(Option<Entry>, usize)> {
         let field = u16::from_le_bytes(b.get(n..n + 2)?.try_into().unwrap());
         let length = usize::from(*b.get(n + 2)?);
         let value = b.get(n + 3..n + 3 + length)?;
-        // Values stand in the record as they stood on the wire: network order.
-        let word = || i32::from_be_bytes(value.try_into().unwrap());
+        // Values are recorded as on the wire, in network byte order.
+        let int = || i32::from_be_bytes(value.try_into().unwrap());
         if field == heartbeat_field {
-            found = Some(word());
+            found = Some(int());
         } else if field == mode_field {
-            mode = word();
+            mode = int();
         } else if (first_rate..first_rate + 6).contains(&field) {
             rates[usize::from(field - first_rate)] = f64::from_be_bytes(value.try_into().unwrap());
         }

@@ -1,5 +1,5 @@
-//! The daemon's own link and command cycle against the mock controller's own server, in lock step: real loopback TCP, real RTDE bytes,
-//! the real control script, and a clock that the test keeps. A stalled host changes nothing.
+//! The daemon's link and command cycle against the mock controller's server in lock step: loopback TCP, RTDE, the
+//! control script, and a clock that the test controls, so that a stall of the host does not matter.
 
 use std::collections::VecDeque;
 use std::net::{IpAddr, Ipv4Addr};
@@ -22,13 +22,13 @@ use nalgebra::{Matrix2, Matrix6};
 
 pub(crate) const MS: u64 = 1_000_000;
 const CYCLE: u64 = 2 * MS;
-/// From exposure to result.
+/// Time from exposure to result, ns.
 const DELAY: u64 = 30 * MS;
 
-/// Rates and accelerations that the daemon promises by default; the mock's oracle holds it to them.
-const PROMISE: (f64, f64) = (0.5, 4.0);
+/// The daemon's default limits of rates (rad/s) and accelerations (rad/s²), which the mock checks.
+const LIMITS: (f64, f64) = (0.5, 4.0);
 
-/// One cell: robot, link, loop, and cameras that see perfectly.
+/// One cell: robot, link, command cycle, and ideal cameras.
 pub(crate) struct Cell {
     pub(crate) server: Server,
     pub(crate) link: Option<UrLink>,
@@ -36,9 +36,9 @@ pub(crate) struct Cell {
     pub(crate) ended: Option<LinkFault>,
     pub(crate) cycle: CommandCycle,
     pub(crate) now: u64,
-    /// The client says nothing more, but stays connected.
+    /// The client sends nothing, but stays connected.
     pub(crate) silent: bool,
-    /// Every set-point: when, rates.
+    /// Every set-point: time and rates.
     pub(crate) sent: Vec<(u64, Joints)>,
     status: LinkStatus,
     config: CycleConfig,
@@ -47,11 +47,11 @@ pub(crate) struct Cell {
     pipeline: VecDeque<(u64, Vision)>,
     next_capture: u64,
     sequence: u64,
-    /// Packages written in the last cycle, which the server is to find in this one.
-    on_the_way: u64,
+    /// Number of packages written in the last cycle, which the server receives in this one.
+    in_transit: u64,
 }
 
-/// A server that runs in real time while somebody connects.
+/// Runs the server in real time during `act`.
 pub(crate) fn while_serving<T>(server: Server, act: impl FnOnce() -> T) -> (Server, T) {
     let stop = Arc::new(AtomicBool::new(false));
     let stopped = Arc::clone(&stop);
@@ -65,7 +65,7 @@ pub(crate) fn while_serving<T>(server: Server, act: impl FnOnce() -> T) -> (Serv
     (thread.join().unwrap(), done)
 }
 
-/// A mock on an address of its own, and the configuration that leads there.
+/// A mock on a free loopback address, and the configuration of its client.
 pub(crate) fn mock(before: &[Command]) -> (Server, UrConfig) {
     static NEXT: AtomicU8 = AtomicU8::new(1);
     let id = std::process::id();
@@ -74,11 +74,11 @@ pub(crate) fn mock(before: &[Command]) -> (Server, UrConfig) {
     for _ in 0..250 {
         let n = NEXT.fetch_add(1, Ordering::Relaxed);
         let address = Ipv4Addr::new(127, 64 + (id >> 8) as u8 % 128, id as u8, n.max(1));
-        let mut world = World::new(Robot::new(setup.clone()), Some(PROMISE), None);
+        let mut world = World::new(Robot::new(setup.clone()), Some(LIMITS), None);
         for command in before {
             world.command(command.clone(), now_ns()).unwrap();
         }
-        // Somebody else's mock may stand there already.
+        // Another mock may use the address already.
         if let Ok(server) = Server::bind(world, IpAddr::V4(address), 0, None) {
             let config = UrConfig { acceleration: 40.0, ..UrConfig::new(address.to_string(), Model::Ur5e) };
             return (server, UrConfig { stop_acceleration: 4.0, timeout: Duration::from_secs(20), ..config });
@@ -87,7 +87,8 @@ pub(crate) fn mock(before: &[Command]) -> (Server, UrConfig) {
     panic!("no free loopback address");
 }
 
-/// A second of the robot's own time for every real one is enough for a link to come up; what it must answer is in `ArmError`.
+/// A second of the robot's own time for every real one is enough for a link to come up; what it must answer is in
+/// `ArmError`.
 pub(crate) fn bring_up(config: &UrConfig) -> Result<UrLink, ArmError> {
     let mut link = UrLink::connect(config)?;
     link.bring_up(config)?;
@@ -119,18 +120,18 @@ impl Cell {
     /// A cell whose link is up and whose arm is idle.
     ///
     /// # Errors
-    /// What the link says when the robot is not as it should be.
+    /// Why the link did not come up.
     pub(crate) fn start(before: &[Command], tune: impl FnOnce(&mut CycleSettings)) -> Result<Cell, ArmError> {
         let (server, config) = mock(before);
         let (server, link) = while_serving(server, || bring_up(&config));
         Ok(Cell::with(server, link?, tune))
     }
 
-    /// A cell round a link that is up.
+    /// A cell with a link that is up.
     pub(crate) fn with(server: Server, link: UrLink, tune: impl FnOnce(&mut CycleSettings)) -> Cell {
         let dh = Dh::nominal(Model::Ur5e);
         let gripper = gripper();
-        // The marks' side (y of the gripper) towards the cameras.
+        // The marks (y axis of the gripper) face the cameras.
         let facing = exp_twist(&Twist::new(0.0, 0.0, 0.0, -std::f64::consts::FRAC_PI_2, 0.0, 0.0));
         let goal = Pose::translation(0.2, 0.0, 1.45) * facing;
         let base_from_left = dh.base_from_gripper(&READY, &gripper.flange_from_gripper) * goal.inverse();
@@ -163,32 +164,32 @@ impl Cell {
             pipeline: VecDeque::new(),
             next_capture: now,
             sequence: 0,
-            on_the_way: 0,
+            in_transit: 0,
         }
     }
 
-    /// The loop is told an arm whose lengths are this many times the true ones.
-    pub(crate) fn mistake_lengths(&mut self, times: f64) {
+    /// Scales the lengths of the arm in the cycle's kinematics; the true arm stays as it is.
+    pub(crate) fn scale_lengths(&mut self, factor: f64) {
         let mut config = self.config.clone();
-        config.dh.a = config.dh.a.map(|v| v * times);
-        config.dh.d = config.dh.d.map(|v| v * times);
+        config.dh.a = config.dh.a.map(|v| v * factor);
+        config.dh.d = config.dh.d.map(|v| v * factor);
         self.cycle = CommandCycle::new(config).unwrap();
     }
 
-    /// An order of the control port.
-    pub(crate) fn order(&mut self, command: Command) {
+    /// Executes a command of the mock's control port.
+    pub(crate) fn inject(&mut self, command: Command) {
         self.server.world.command(command, self.now).unwrap();
     }
 
-    /// Fastest joint, by the truth.
+    /// True speed of the fastest joint, rad/s.
     pub(crate) fn arm_speed(&self) -> f64 {
         self.server.world.robot.truth.actual_qd.iter().fold(0.0, |m, v| v.abs().max(m))
     }
 
-    /// One cycle: what was written arrives, the robot steps, its state arrives, the loop answers.
+    /// One cycle: the last packages arrive, the robot steps, its state arrives, the command cycle answers.
     pub(crate) fn cycle(&mut self, request: Option<RequestKind>, offer: bool) -> CommandOutput {
         self.now += CYCLE;
-        self.take_in();
+        self.serve();
         self.server.step(self.now);
         self.take_image();
         let robot = self.poll();
@@ -209,16 +210,16 @@ impl Cell {
         output
     }
 
-    /// As the command thread does it.
+    /// Sends as the command thread does.
     fn send(&mut self, output: &CommandOutput) {
-        self.on_the_way = 0;
+        self.in_transit = 0;
         let Some(link) = self.link.as_mut().filter(|_| !self.silent) else { return };
         let before = link.stats();
         self.sent.push((self.now, output.command.rates));
         match link.send(&output.command) {
             Ok(()) if link.stats().dropped == before.dropped => {
                 self.status.blocked_sends = 0;
-                self.on_the_way = link.stats().sent - before.sent;
+                self.in_transit = link.stats().sent - before.sent;
             }
             Ok(()) => self.status.blocked_sends += 1,
             Err(fault) => self.drop_link(fault),
@@ -237,7 +238,7 @@ impl Cell {
         let open = wire.mute_until <= self.now && wire.hold_until <= self.now && wire.delay_ns == 0 && !thinned;
         let link = self.link.as_mut()?;
         if open {
-            // What was sent is there, or will be in a moment of real time.
+            // The state was sent and arrives within a moment of real time.
             link.wait(now_ns() + 20 * MS);
         }
         let poll = link.poll(self.now);
@@ -252,15 +253,15 @@ impl Cell {
         }
     }
 
-    /// Lets the server read what was written in the last cycle.
-    fn take_in(&mut self) {
+    /// Lets the server read the packages of the last cycle.
+    fn serve(&mut self) {
         let wire = self.server.world.wire(Port::Rtde);
-        let heard = wire.deaf_until <= self.now && wire.unread_until <= self.now;
-        let goal = self.server.world.judge.summary().inputs + self.on_the_way;
+        let reads = wire.deaf_until <= self.now && wire.unread_until <= self.now;
+        let goal = self.server.world.judge.summary().inputs + self.in_transit;
         let begin = Instant::now();
         loop {
             self.server.serve(self.now);
-            if !heard || self.server.world.judge.summary().inputs >= goal || begin.elapsed() > Duration::from_secs(1) {
+            if !reads || self.server.world.judge.summary().inputs >= goal || begin.elapsed() > Duration::from_secs(1) {
                 return;
             }
             std::thread::yield_now();
@@ -302,14 +303,14 @@ impl Cell {
         self.pipeline.push_back((self.now + DELAY, vision));
     }
 
-    /// Cycles for so long.
+    /// Runs cycles for this time.
     pub(crate) fn run(&mut self, ms: u64) {
         for _ in 0..ms * MS / CYCLE {
             self.cycle(None, false);
         }
     }
 
-    /// Set-point in and armed; what the servo request answers.
+    /// Sends the set-point, arms, and returns the answer to the servo request.
     pub(crate) fn ask_servo(&mut self) -> Result<(), graspd_rt::mode::Reject> {
         self.run(600);
         assert_eq!(self.cycle(None, true).setpoint_reply, Some(Ok(())));
@@ -318,7 +319,7 @@ impl Cell {
         self.cycle(Some(RequestKind::Servo), false).reply.unwrap().result
     }
 
-    /// In motion, past the slow beginning.
+    /// Starts a motion and waits until a joint moves faster than 0.1 rad/s.
     pub(crate) fn move_off(&mut self) {
         assert_eq!(self.ask_servo(), Ok(()));
         for _ in 0..5_000 {
@@ -328,7 +329,7 @@ impl Cell {
                 return;
             }
         }
-        panic!("never came to speed");
+        panic!("the arm did not reach 0.1 rad/s");
     }
 }
 

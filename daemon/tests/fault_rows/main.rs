@@ -1,9 +1,10 @@
-//! Every row R (link) and B (robot) of the fault catalogue: provoked on the mock controller by its control port's own orders, and what
-//! the daemon's link and command cycle must say, by when, and that the arm rests and stays at rest.
+//! Faults of the link and of the robot, injected into the mock controller: the code that the daemon's link and command
+//! cycle must report, the time within which, and that the arm comes to rest and stays at rest.
 //!
-//! The clock is the test's, so the figures printed (`--nocapture`) are exact and the same everywhere.
+//! The rows are numbered R (link) and B (robot). The test controls the clock, so that the printed figures
+//! (`--nocapture`) are exact and reproducible.
 #![cfg(feature = "demo")]
-#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test: a failure is to be seen at once
+#![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a failure must panic
 
 mod cell;
 
@@ -15,35 +16,36 @@ use graspd_rt::mode::{ModeName, Reject};
 
 /// The RTDE port.
 const RTDE: Port = Port::Rtde;
-/// From full speed to rest at the daemon's 4 rad/s2, and what the guard's filter, the link and the drives add.
+/// Time from full speed to rest at the daemon's 4 rad/s², and the delays of the guard's filter, the link and the
+/// drives, ms.
 const RAMP_MS: u64 = 125 + 20 + 60;
 
-/// Our set-points do not arrive.
-const UNHEARD: &[&str] = &["F-ARM-03", "F-ARM-11"];
+/// Codes for set-points that do not arrive.
+const NO_COMMANDS: &[&str] = &["F-ARM-03", "F-ARM-11"];
 
-/// What a fault in motion must lead to.
+/// The expected result of a fault in motion.
 #[derive(Clone, Copy)]
 enum Expect {
-    /// A latched fault with one of these codes, named within so many ms.
+    /// A latched fault with one of these codes, reported within this time, ms.
     Fault(&'static [&'static str], u64),
-    /// A hold with this code.
+    /// A hold with this code, reported within this time, ms.
     Hold(&'static str, u64),
-    /// Nothing: the motion arrives all the same.
+    /// No fault: the motion reaches its goal.
     Arrives,
 }
 
 use Expect::{Arrives, Fault, Hold};
 
-/// What is wrong, and what must follow.
+/// An injected fault and its expected result.
 struct Row {
     row: &'static str,
     what: &'static str,
-    orders: Vec<Command>,
+    commands: Vec<Command>,
     expect: Expect,
 }
 
-fn row(row: &'static str, what: &'static str, order: Command, expect: Expect) -> Row {
-    Row { row, what, orders: vec![order], expect }
+fn row(row: &'static str, what: &'static str, command: Command, expect: Expect) -> Row {
+    Row { row, what, commands: vec![command], expect }
 }
 
 fn link_rows() -> Vec<Row> {
@@ -53,15 +55,15 @@ fn link_rows() -> Vec<Row> {
         row("R02", "closed", Command::Close { port: RTDE }, Fault(&["F-ARM-01"], 4)),
         row("R03", "cable out", Command::Blackhole { port: RTDE, seconds: long }, Fault(&["F-ARM-02"], 24)),
         row("R03", "no states", Command::LoseDownstream { port: RTDE, seconds: long }, Fault(&["F-ARM-02"], 24)),
-        // The script on the robot may say first that it hears nothing (F-ARM-11, its fault 4).
-        row("R04", "our writes lost", Command::LoseUpstream { port: RTDE, seconds: long }, Fault(UNHEARD, 56)),
+        // The script on the robot may report the missing heartbeat first (F-ARM-11, script fault 4).
+        row("R04", "our writes lost", Command::LoseUpstream { port: RTDE, seconds: long }, Fault(NO_COMMANDS, 56)),
         row("R04", "no echo", Command::MuteOutputs { on: true }, Fault(&["F-ARM-03"], 56)),
         row("R05", "8 to 12 ms late", Command::Delay { port: RTDE, ms: 8.0, jitter_ms: 4.0 }, Arrives),
         row("R05", "60 ms late", Command::Delay { port: RTDE, ms: 60.0, jitter_ms: 10.0 }, Fault(&["F-ARM-02"], 24)),
         row("R06", "burst after 12 ms", Command::Hold { port: RTDE, seconds: 0.012 }, Arrives),
         row("R06", "burst after 80 ms", Command::Hold { port: RTDE, seconds: 0.08 }, Fault(&["F-ARM-02"], 24)),
         row("R07", "pieces of 16 bytes", Command::Chunk { port: RTDE, bytes: 16 }, Arrives),
-        // Noise may state a package of up to 64 KiB, and then the states that follow are swallowed as its body.
+        // Noise may look like a package of up to 64 KiB, whose body then swallows the states that follow.
         row("R08", "noise", Command::Garbage { port: RTDE, bytes: 4000 }, Fault(&["F-ARM-01", "F-ARM-02"], 24)),
         row("R08", "impossible length", Command::WrongLength { port: RTDE }, Fault(&["F-ARM-01"], 4)),
         row("R08", "unknown type", Command::UnknownType { port: RTDE }, Fault(&["F-ARM-01"], 4)),
@@ -70,13 +72,13 @@ fn link_rows() -> Vec<Row> {
         row("R12", "clock restarts", Command::ClockRestart, Fault(&["F-ARM-01", "F-ARM-13"], 4)),
         row("R12", "clock goes back", Command::ClockShift { seconds: -1.0 }, Fault(&["F-ARM-01", "F-ARM-13"], 4)),
         row("R13", "another token", Command::OutputInt { index: 27, value: 4711 }, Fault(&["F-ARM-12"], 4)),
-        row("R13", "another program", foreign(), Fault(&["F-ARM-03", "F-ARM-10"], 56)),
-        row("R14", "never reads", Command::StopReading { port: RTDE, seconds: long }, Fault(UNHEARD, 56)),
+        row("R13", "another program", other_program(), Fault(&["F-ARM-03", "F-ARM-10"], 56)),
+        row("R14", "never reads", Command::StopReading { port: RTDE, seconds: long }, Fault(NO_COMMANDS, 56)),
     ]
 }
 
-/// A program of somebody else, which stands still.
-fn foreign() -> Command {
+/// A program of another client that does not move the arm.
+fn other_program() -> Command {
     Command::Script { text: "def other():\n  while True:\n    sync()\n  end\nend\n".to_owned() }
 }
 
@@ -102,20 +104,20 @@ fn robot_rows() -> Vec<Row> {
         row("B10", "position NaN", Command::NanPosition { joint: 2 }, Fault(&["F-ARM-16"], 4)),
         row("B10", "speed NaN", Command::NanSpeed { joint: 4 }, Fault(&["F-ARM-16"], 4)),
         row("B10", "jump", Command::Jump { joint: 1, rad: 0.3, seconds: 0.2 }, Fault(&["F-ARM-16"], 4)),
-        row("B11", "elsewhere at once", Command::Teleport { q: [0.0; 6] }, Fault(&["F-ARM-16"], 4)),
+        row("B11", "teleported", Command::Teleport { q: [0.0; 6] }, Fault(&["F-ARM-16"], 4)),
         row("B15", "collision", Command::Collision { force: 150.0 }, Fault(&["F-ARM-05"], 4)),
         row("B17", "joints swapped", Command::SwapJoints { a: 1, b: 2 }, Fault(&["F-ARM-16"], 4)),
     ]
 }
 
-/// Runs a row in the middle of a motion.
+/// Injects the fault of a row during a motion.
 fn in_motion(r: &Row) {
     let label = format!("{} {}", r.row, r.what);
     let mut cell = Cell::start(&[], |_| {}).unwrap_or_else(|e| panic!("{label}: {e}"));
     cell.move_off();
     let injected = cell.now;
-    for order in &r.orders {
-        cell.order(order.clone());
+    for command in &r.commands {
+        cell.inject(command.clone());
     }
     match r.expect {
         Arrives => arrives(&mut cell, &label, r),
@@ -128,7 +130,7 @@ fn in_motion(r: &Row) {
 
 fn arrives(cell: &mut Cell, label: &str, r: &Row) {
     let from = cell.now;
-    let reduced = matches!(r.orders[..], [Command::Reduced { on: true }]);
+    let reduced = matches!(r.commands[..], [Command::Reduced { on: true }]);
     let cap = 0.4 * 0.5;
     while cell.cycle.mode().name() != ModeName::Converged {
         let out = cell.cycle(None, false);
@@ -143,9 +145,9 @@ fn arrives(cell: &mut Cell, label: &str, r: &Row) {
     println!("{label:<28} arrives after {} ms", (cell.now - from) / MS);
 }
 
-/// Named in bound, at rest in bound, stays so when the cause has gone.
+/// Reported within its bound, at rest within its bound, and still at rest when the cause is removed.
 fn stops(cell: &mut Cell, label: &str, codes: &[&str], bound: u64, injected: u64, latched: bool) {
-    let mut named = None;
+    let mut reported = None;
     let mut rest = None;
     while cell.now < injected + (bound + RAMP_MS) * MS {
         let out = cell.cycle(None, false);
@@ -155,19 +157,20 @@ fn stops(cell: &mut Cell, label: &str, codes: &[&str], bound: u64, injected: u64
             Why::Hold(cause) => Some((cause.code(), cause.to_string())),
             _ => None,
         });
-        named = named.or(code.map(|c| (c, after)));
+        reported = reported.or(code.map(|c| (c, after)));
         rest = if cell.arm_speed() < 1e-3 { rest.or(Some(after)) } else { None };
     }
-    let ((code, words), after) = named.unwrap_or_else(|| panic!("{label}: not noticed"));
-    assert!(codes.contains(&code), "{label}: {code} {words}, wanted {codes:?}");
+    let ((code, text), after) = reported.unwrap_or_else(|| panic!("{label}: not reported"));
+    assert!(codes.contains(&code), "{label}: {code} {text}, expected {codes:?}");
     assert!(after <= bound, "{label}: {code} only after {after} ms");
     let rest = rest.unwrap_or_else(|| panic!("{label}: still at {} rad/s", cell.arm_speed()));
     let why = cell.ended.map_or(String::new(), |f| format!("; link: {f}"));
-    println!("{label:<28} {code} after {after:>2} ms, at rest after {rest:>3} ms: {words}{why}");
-    // The cause goes, the robot is well again: nothing moves by itself, and the first cause is kept.
-    for order in [Command::ClearFaults, Command::SpeedSlider { fraction: 1.0 }, Command::ClearSafety, Command::Restore]
+    println!("{label:<28} {code} after {after:>2} ms, at rest after {rest:>3} ms: {text}{why}");
+    // The causes are removed: the arm does not move by itself, and the first cause is kept.
+    for command in
+        [Command::ClearFaults, Command::SpeedSlider { fraction: 1.0 }, Command::ClearSafety, Command::Restore]
     {
-        cell.order(order);
+        cell.inject(command);
     }
     for _ in 0..250 {
         cell.cycle(None, false);
@@ -186,20 +189,20 @@ fn stops(cell: &mut Cell, label: &str, codes: &[&str], bound: u64, injected: u64
 }
 
 #[test]
-fn rows_of_the_link_in_motion() {
+fn link_faults_in_motion() {
     link_rows().iter().for_each(in_motion);
 }
 
 #[test]
-fn rows_of_the_robot_in_motion() {
+fn robot_faults_in_motion() {
     robot_rows().iter().for_each(in_motion);
 }
 
-/// R16, and R15 when the watchdog has no effect: a client that says nothing more leaves an arm that stops by itself.
+/// R16, and R15 when the watchdog has no effect: without commands the arm stops by itself.
 #[test]
-fn a_client_that_falls_silent_leaves_an_arm_at_rest() {
-    for deaf in [false, true] {
-        let mut cell = Cell::start(&[Command::NoWatchdog { on: deaf }], |_| {}).unwrap();
+fn the_arm_stops_when_the_client_sends_nothing() {
+    for no_watchdog in [false, true] {
+        let mut cell = Cell::start(&[Command::NoWatchdog { on: no_watchdog }], |_| {}).unwrap();
         cell.move_off();
         let from = cell.now;
         cell.silent = true;
@@ -209,17 +212,17 @@ fn a_client_that_falls_silent_leaves_an_arm_at_rest() {
             rest = if cell.arm_speed() < 1e-3 { rest.or(Some((cell.now - from) / MS)) } else { None };
         }
         let rest = rest.expect("still moving a second later");
-        println!("{} silent client: at rest after {rest} ms", if deaf { "R15 no watchdog," } else { "R16" });
+        println!("{} silent client: at rest after {rest} ms", if no_watchdog { "R15 no watchdog," } else { "R16" });
         assert!(rest <= 50 + RAMP_MS, "{rest} ms");
-        // With the watchdog the program is over; without it our own script waits for a cycle that moves.
+        // The watchdog ends the program; without it the script keeps waiting for a heartbeat.
         let runtime = cell.server.world.robot.runtime;
-        assert_eq!(runtime == RuntimeState::Stopped, !deaf, "{runtime:?}");
+        assert_eq!(runtime == RuntimeState::Stopped, !no_watchdog, "{runtime:?}");
     }
 }
 
-/// R01, R09, R15, B03: what is wrong before there is a link, refused with a reason that says what and where.
+/// R01, R09, R15, B03: faults before the link is up are refused with a reason.
 #[test]
-fn rows_before_the_link_is_up_are_refused_by_name() {
+fn faults_before_the_link_is_up_are_refused_with_their_reason() {
     let names = || vec!["input_double_register_25".to_owned()];
     let outputs = || vec!["actual_qd".to_owned()];
     let rows: [(&str, Command, &[&str]); 9] = [
@@ -233,21 +236,21 @@ fn rows_before_the_link_is_up_are_refused_by_name() {
         ("B03 brakes on", Command::RobotMode { mode: RobotMode::Idle }, &["not ready", "graspd recover"]),
         ("B03 local control", Command::RemoteControl { on: false }, &["Remote Control"]),
     ];
-    for (label, order, parts) in rows {
-        let (server, mut config) = mock(&[order]);
+    for (label, command, parts) in rows {
+        let (server, mut config) = mock(&[command]);
         config.timeout = std::time::Duration::from_secs(2);
         let (_server, link) = while_serving(server, || bring_up(&config));
         let error = link.err().unwrap_or_else(|| panic!("{label}: the link came up")).to_string();
         println!("{label:<28} {error}");
         for part in parts {
-            assert!(error.to_lowercase().contains(&part.to_lowercase()), "{label}: {error} says nothing of {part}");
+            assert!(error.to_lowercase().contains(&part.to_lowercase()), "{label}: {error} does not contain {part}");
         }
     }
 }
 
-/// R10: a controller that knows version 1 only is driven all the same.
+/// R10: a controller that supports protocol version 1 only.
 #[test]
-fn an_old_controller_is_driven_in_protocol_version_1() {
+fn an_old_controller_is_used_with_protocol_version_1() {
     let mut cell = Cell::start(&[Command::RefuseV2 { on: true }], |_| {}).unwrap();
     cell.move_off();
     let r = row("R10", "version 1", Command::Ping, Arrives);
@@ -255,29 +258,29 @@ fn an_old_controller_is_driven_in_protocol_version_1() {
     assert_eq!(cell.server.world.judge.summary().limit_violations, 0);
 }
 
-/// R15: a control script of another version is refused with both numbers.
+/// R15: a control script of another version is refused.
 #[test]
 fn a_script_of_another_version_is_refused() {
     let (server, config) = mock(&[]);
     let (mut server, link) = while_serving(server, || graspd::arm::UrLink::connect(&config));
     let mut link = link.unwrap();
-    // A robot whose script answers to our token, and says that it is version 9.
+    // A robot whose script echoes the token and reports version 9.
     let token = graspd::arm::ArmLink::token(&link);
-    for order in [
+    for command in [
         Command::MuteOutputs { on: true },
         Command::OutputInt { index: 25, value: 1 },
         Command::OutputInt { index: 27, value: token },
         Command::OutputInt { index: 28, value: 9 },
     ] {
-        server.world.command(order, 0).unwrap();
+        server.world.command(command, 0).unwrap();
     }
     let (_server, result) = while_serving(server, || link.bring_up(&config));
     assert!(matches!(result, Err(ArmError::ScriptVersion { found: 9, .. })), "{result:?}");
 }
 
-/// B17: another kind of arm than configured.
+/// B17: another model than configured.
 #[test]
-fn another_kind_of_arm_is_refused() {
+fn another_model_is_refused() {
     let (server, config) = mock(&[Command::ClaimRobotType { number: 2 }]);
     let (_server, identity) = while_serving(server, || read_identity(&config));
     let refused = check_model(&identity.unwrap(), graspd_rt::arm::Model::Ur5e).unwrap_err().to_string();
@@ -285,20 +288,20 @@ fn another_kind_of_arm_is_refused() {
     assert!(refused.contains("robot type 2") && refused.contains("arm.model"), "{refused}");
 }
 
-/// B09: the arm creeps while it is armed and told to rest. B08: it does not follow.
+/// B09: the arm moves slowly while it is armed and commanded to rest. B08: it does not follow its set-points.
 #[test]
-fn an_arm_that_does_not_obey_is_noticed() {
+fn an_arm_that_does_not_follow_its_commands_is_a_fault() {
     let mut cell = Cell::start(&[], |_| {}).unwrap();
     cell.run(600);
     cell.cycle(None, true);
     assert_eq!(cell.cycle(Some(RequestKind::Arm), false).reply.unwrap().result, Ok(()));
     cell.run(300);
     let from = cell.now;
-    cell.order(Command::Drift { joint: 2, rate: 0.05 });
+    cell.inject(Command::Drift { joint: 2, rate: 0.05 });
     while cell.cycle.mode().fault().is_none() && cell.now < from + 1_000 * MS {
         cell.cycle(None, false);
     }
-    let fault = cell.cycle.mode().fault().expect("a creeping arm was not noticed");
+    let fault = cell.cycle.mode().fault().expect("the motion was not detected");
     let after = (fault.at_ns - from) / MS;
     println!("B09 creeps                   {} after {after} ms: {}", fault.cause.code(), fault.cause);
     assert_eq!(fault.cause.code(), "F-ARM-15");
@@ -310,43 +313,43 @@ fn an_arm_that_does_not_obey_is_noticed() {
         let rates = cell.sent.last().unwrap().1;
         let joint = (0..6).fold(0, |m, i| if rates[i].abs() > rates[m].abs() { i } else { m });
         let from = cell.now;
-        cell.order(if slow { Command::Lag { seconds: 3.0 } } else { Command::Stuck { joint } });
+        cell.inject(if slow { Command::Lag { seconds: 3.0 } } else { Command::Stuck { joint } });
         while cell.cycle.mode().drives() && cell.now < from + 4_000 * MS {
             cell.cycle(None, false);
         }
         let fault = *cell.cycle.mode().fault().unwrap_or_else(|| panic!("{what}: {:?}", cell.cycle.mode()));
         let after = (fault.at_ns - from) / MS;
         println!("B08 {what:<24} {} after {after} ms: {}", fault.cause.code(), fault.cause);
-        // The images may see it before the joints do.
+        // The images may show it before the joints do.
         let known = ["F-ARM-14", "F-ARM-05", "F-MRK-01", "F-MRK-02", "F-LAW-01"];
         assert!(known.contains(&fault.cause.code()), "{:?}", fault.cause);
-        cell.order(Command::ClearFaults);
+        cell.inject(Command::ClearFaults);
         cell.run(400);
         assert!(cell.arm_speed() < 1e-3, "{what}: still moving");
     }
 }
 
-/// B07 and B11: a way that ends at a joint's end or at a singularity is refused before anything moves.
+/// B07 and B11: a path that ends at a joint limit or at a singularity is refused before the arm moves.
 #[test]
-fn a_way_out_of_range_is_refused_before_it_begins() {
-    // The goal of the third joint lies outside what the configuration leaves of its range.
+fn a_path_out_of_range_is_refused_before_it_begins() {
+    // The goal of the third joint is outside its configured range.
     let mut cell = Cell::start(&[], |s| s.limits.position_min_rad[2] = graspd_rt::arm::READY[2] + 0.06).unwrap();
     assert_eq!(cell.ask_servo(), Err(Reject::OutOfReach), "B07");
     cell.run(200);
     assert!(cell.arm_speed() < 1e-3);
-    // A singularity is one as soon as the threshold says so: every pose of this arm is.
+    // With this threshold every pose of the arm counts as singular.
     let mut cell = Cell::start(&[], |s| s.rates.hard_sigma = 10.0).unwrap();
     assert_eq!(cell.ask_servo(), Err(Reject::OutOfReach), "B11");
     cell.run(200);
     assert!(cell.arm_speed() < 1e-3);
 }
 
-/// R06: of a backlog only the newest state counts, and what was commanded meanwhile is not replayed.
+/// R06: of delayed states only the newest is used, and each cycle sends one command.
 #[test]
 fn a_backlog_is_not_replayed() {
     let mut cell = Cell::start(&[], |_| {}).unwrap();
     cell.move_off();
-    cell.order(Command::Hold { port: RTDE, seconds: 0.014 });
+    cell.inject(Command::Hold { port: RTDE, seconds: 0.014 });
     let mut packages = Vec::new();
     for _ in 0..12 {
         let before = cell.link.as_ref().map(graspd::arm::ArmLink::stats).unwrap();
@@ -358,10 +361,10 @@ fn a_backlog_is_not_replayed() {
     assert!(packages.iter().all(|(_, sent)| *sent == 1), "one command a cycle, burst or not: {packages:?}");
 }
 
-/// The link's own words for what ends it.
+/// The link's text for each of its faults.
 #[test]
-fn a_link_that_ends_says_why() {
-    for (order, part) in [
+fn a_link_that_ends_reports_its_fault() {
+    for (command, part) in [
         (Command::Close { port: RTDE }, "closed"),
         (Command::WrongLength { port: RTDE }, "framing"),
         (Command::UnknownType { port: RTDE }, "protocol"),
@@ -369,23 +372,23 @@ fn a_link_that_ends_says_why() {
     ] {
         let mut cell = Cell::start(&[], |_| {}).unwrap();
         cell.run(20);
-        cell.order(order);
+        cell.inject(command);
         cell.run(20);
-        let fault: LinkFault = cell.ended.expect("the link goes on");
+        let fault: LinkFault = cell.ended.expect("the link is still up");
         assert!(fault.to_string().contains(part), "{fault}");
     }
 }
 
-/// Kinematics that are not the arm's make the gripper's speed cap another than its figure: the controller's own word on
-/// its tool point says so, wherever that point is. A controller that does not say it is driven all the same.
+/// With wrong kinematics the gripper's speed differs from the computed one. The tool speed that the controller reports
+/// shows it, for any tool point. A controller that does not report it is supported.
 #[test]
-fn kinematics_that_are_not_the_arms_are_noticed_by_the_controllers_own_speed() {
+fn wrong_kinematics_are_detected_by_the_controllers_tool_speed() {
     let tool = Command::Tcp { pose: [0.02, -0.03, 0.17, 0.1, 0.2, -0.3] };
-    for (times, noticed) in [(0.8, true), (1.25, true), (1.0, false)] {
+    for (factor, detected) in [(0.8, true), (1.25, true), (1.0, false)] {
         let mut cell = Cell::start(std::slice::from_ref(&tool), |_| {}).unwrap();
-        cell.mistake_lengths(times);
+        cell.scale_lengths(factor);
         cell.run(600);
-        assert_eq!(cell.ask_servo(), Ok(()), "{times}");
+        assert_eq!(cell.ask_servo(), Ok(()), "{factor}");
         let from = cell.now;
         while cell.cycle.mode().drives()
             && cell.cycle.mode().name() != ModeName::Converged
@@ -394,11 +397,11 @@ fn kinematics_that_are_not_the_arms_are_noticed_by_the_controllers_own_speed() {
             cell.cycle(None, false);
         }
         let code = cell.cycle.mode().fault().map(|f| (f.cause.code(), f.cause.to_string()));
-        println!("B17 lengths x {times:<14} {code:?} after {} ms", (cell.now - from) / MS);
-        assert_eq!(code.map(|c| c.0), noticed.then_some("F-ARM-17"), "{times}");
+        println!("B17 lengths x {factor:<14} {code:?} after {} ms", (cell.now - from) / MS);
+        assert_eq!(code.map(|c| c.0), detected.then_some("F-ARM-17"), "{factor}");
     }
     let mut cell = Cell::start(&[Command::NotFound { names: vec!["tcp_offset".to_owned()] }], |_| {}).unwrap();
     assert!(cell.link.as_ref().unwrap().state().unwrap().tool.is_none());
     cell.move_off();
-    arrives(&mut cell, "B17 tool point not told", &row("B17", "not told", Command::Ping, Arrives));
+    arrives(&mut cell, "B17 no tool point", &row("B17", "no tool point", Command::Ping, Arrives));
 }

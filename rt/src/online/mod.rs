@@ -18,6 +18,7 @@
 //! | [`rates`] | a gripper screw to joint rates |
 
 pub mod acquire;
+mod arm_motion;
 mod content;
 mod frame;
 pub mod interaction;
@@ -34,6 +35,7 @@ pub mod screw;
 mod vision;
 mod vision_cycle;
 
+pub use arm_motion::{ArmMotion, mid_exposure_ns};
 pub use frame::{FrameFaults, FrameLimits, FrameReject, StereoFrame};
 pub use observation::{MarkObservation, RigHealth};
 pub use vision::{Vision, VisionStatus};

@@ -1,6 +1,6 @@
-//! The simulated cell: a world on disk, and three processes in it.
+//! The simulated cell: a world on disk and three processes.
 
-use super::process::Part;
+use super::process::DemoProcess;
 use crate::cli::DemoArgs;
 use crate::exit::{Exit, Failure};
 use graspd_hil::scenario::{Options, Scenario};
@@ -8,25 +8,25 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// How long a part may take to be ready: the scene renders its fixed layers first.
-const READY: Duration = Duration::from_secs(40);
+/// Timeout of the start of a process: the scene renders its fixed layers first.
+const START_TIMEOUT: Duration = Duration::from_secs(40);
 
-/// A world and its processes. Dropping it ends them: the daemon first, so that the arm is ramped down by its own hand.
+/// A world and its processes. Dropping it ends them, the daemon first, so that it ramps the arm down.
 #[derive(Debug)]
 pub(super) struct Cell {
     /// `graspd run`.
-    pub daemon: Part,
+    pub daemon: DemoProcess,
     /// `graspd-scene`.
-    pub scene: Part,
+    pub scene: DemoProcess,
     /// `graspd-mock-ur`.
-    pub mock: Part,
+    pub mock: DemoProcess,
     /// The daemon's configuration.
     pub config: PathBuf,
     /// The world's folder.
     pub world: PathBuf,
-    /// What was drawn.
+    /// The world as drawn.
     pub scenario: Scenario,
-    /// Pairs the scene had published, and when, as first asked.
+    /// Number of pairs that the scene had published at the last query, and its time.
     published: Option<(u64, Instant)>,
 }
 
@@ -40,7 +40,7 @@ fn two(text: &str, key: &str) -> Result<[f64; 2], Failure> {
     Ok([number(a)?, number(b)?])
 }
 
-/// What the world is drawn with.
+/// The errors that the world is drawn with.
 pub(super) fn options(args: &DemoArgs) -> Result<Options, Failure> {
     let mut o = Options::default();
     if let Some(text) = &args.kinematics_error {
@@ -54,8 +54,8 @@ pub(super) fn options(args: &DemoArgs) -> Result<Options, Failure> {
     Ok(o)
 }
 
-/// A loopback address of our own, on which the controller's ports are free. With an address a demo, neither another demo nor somebody's
-/// outgoing connection (those take ports of the range that an offset would lead into) can be in the way.
+/// A loopback address on which the controller's ports are free. With one address for each demo no other demo uses its
+/// ports, nor does an outgoing connection, as could happen with a port offset into the range of ephemeral ports.
 fn free_address(seed: u64) -> Result<String, Failure> {
     let start = u64::from(std::process::id()).wrapping_mul(131).wrapping_add(seed.wrapping_mul(17));
     for k in 0..200_u64 {
@@ -72,10 +72,10 @@ fn free_address(seed: u64) -> Result<String, Failure> {
 }
 
 impl Cell {
-    /// Draws the world, starts mock controller, scene and daemon, and waits until each says that it is ready.
+    /// Draws the world, starts mock controller, scene and daemon, and waits until each reports that it is ready.
     ///
     /// # Errors
-    /// A world that cannot be drawn or written, or a part that does not come up.
+    /// A world that cannot be drawn or written, or a process that does not start.
     pub(super) fn start(args: &DemoArgs, folder: &Path) -> Result<Self, Failure> {
         let world = folder.join("world");
         let scenario = Scenario::from_seed(args.seed, &options(args)?)
@@ -97,15 +97,15 @@ impl Cell {
             &s(&world.join("true_arm.toml")),
             "--record",
             &s(&folder.join("wire.jsonl")),
-            // What the daemon promises by its configuration: the mock judges every set-point by it.
+            // The daemon's configured limits, with which the mock compares every set-point.
             "--limits",
             "0.5,4.0",
             "--exit-with-stdin",
         ]
         .map(str::to_owned)
         .to_vec();
-        let mut mock = Part::start("mock-ur", &mock_args, folder)?;
-        mock.json_line(READY)?;
+        let mut mock = DemoProcess::start("mock-ur", &mock_args, folder)?;
+        mock.json_line(START_TIMEOUT)?;
         let scene_args: Vec<String> = [
             "scene",
             "--world",
@@ -121,31 +121,32 @@ impl Cell {
         ]
         .map(str::to_owned)
         .to_vec();
-        let mut scene = Part::start("scene", &scene_args, folder)?;
-        scene.json_line(READY)?;
+        let mut scene = DemoProcess::start("scene", &scene_args, folder)?;
+        scene.json_line(START_TIMEOUT)?;
         let config = folder.join("graspd.toml");
         std::fs::write(&config, config_text(args, &cell, &address, scenario.model.name())).map_err(|e| {
             Failure::input(format!("{}: cannot be written ({e}); choose another folder with --out", config.display()))
         })?;
-        let mut daemon = Part::start("graspd", &["run".to_owned(), "--config".to_owned(), s(&config)], folder)?;
-        daemon.json_line(READY)?;
+        let mut daemon = DemoProcess::start("graspd", &["run".to_owned(), "--config".to_owned(), s(&config)], folder)?;
+        daemon.json_line(START_TIMEOUT)?;
         Ok(Self { daemon, scene, mock, config, world, scenario, published: None })
     }
 
-    /// Pairs a second that the scene published since this was asked last; `None` the first time, or when it does not say.
+    /// Pairs a second that the scene published since the last call; `None` in the first call, or when the scene does
+    /// not answer.
     pub(super) fn pairs_per_second(&mut self) -> Option<f64> {
-        let said = self.scene.ask(r#"{"ask":"status"}"#, Duration::from_secs(3)).ok()?;
-        let now = (said.get("published")?.as_u64()?, Instant::now());
+        let status = self.scene.ask(r#"{"ask":"status"}"#, Duration::from_secs(3)).ok()?;
+        let now = (status.get("published")?.as_u64()?, Instant::now());
         let before = self.published.replace(now)?;
         let seconds = now.1.duration_since(before.1).as_secs_f64();
         (seconds > 0.0).then(|| now.0.saturating_sub(before.0) as f64 / seconds)
     }
 
-    /// Names the part that ended although nobody asked it to.
-    pub(super) fn dead_part(&mut self) -> Option<String> {
+    /// The name and exit status of a process that ended unexpectedly.
+    pub(super) fn dead_process(&mut self) -> Option<String> {
         [("the daemon", &mut self.daemon), ("the scene", &mut self.scene), ("the mock controller", &mut self.mock)]
             .into_iter()
-            .find_map(|(name, part)| part.ended().map(|status| format!("{name} ended ({status})")))
+            .find_map(|(name, process)| process.ended().map(|status| format!("{name} ended ({status})")))
     }
 }
 

@@ -1,8 +1,8 @@
-//! `graspd demo`: the whole chain against a simulated world, each part a process of its own.
+//! `graspd demo`: the complete chain against a simulated world, in separate processes.
 //!
-//! The demo is an operator with two hands: it takes the first images out of shared memory, clicks where the world's script says,
-//! runs `graspd plan`, sends the plan, arms, servoes and watches. It never tells the daemon where anything stands, and the final
-//! error is the scene's word, who knows, not the daemon's.
+//! The demo does what an operator does: it takes the first images from shared memory, clicks where the world's script
+//! has the object, runs `graspd plan`, sends the plan, arms, servoes and watches. The daemon gets no poses of the
+//! world, and the final error is the ground truth of the scene.
 
 mod cell;
 mod process;
@@ -25,7 +25,7 @@ use std::time::{Duration, Instant};
 /// Runs the demo.
 ///
 /// # Errors
-/// Usage, input, a part that does not come up, a fault. A motion that does not converge is [`Exit::NotConverged`].
+/// Usage, input, a process that does not start, a fault. A motion that does not converge is [`Exit::NotConverged`].
 pub fn run(args: &DemoArgs) -> Result<Exit, Failure> {
     if !(args.timeout.is_finite() && args.timeout > 0.0) {
         return Err(Failure {
@@ -44,21 +44,21 @@ pub fn run(args: &DemoArgs) -> Result<Exit, Failure> {
         |e: std::io::Error| Failure::input(format!("{shown}: cannot be used ({e}); choose another folder with --out"));
     std::fs::create_dir_all(&args.out).map_err(wrong)?;
     let folder = args.out.canonicalize().map_err(wrong)?;
-    let say = Say::new(args);
+    let console = Console::new(args);
 
-    say.step("starting mock controller, scene and daemon");
+    console.step("starting mock controller, scene and daemon");
     let mut cell = Cell::start(args, &folder)?;
     let config = crate::config::Config::load(&cell.config)?;
     let node = create_node(&config.names, "graspd-demo").map_err(|e| Failure::link(e.to_string()))?;
     let client = RequestClient::new(&node).map_err(|e| Failure::link(e.to_string()))?;
 
-    say.step("taking the first images");
+    console.step("taking the first images");
     first_images(&config, &config.names, &folder)?;
-    say.step("off line: from two clicks to a set-point");
+    console.step("off-line stage: from two clicks to a set-point");
     let plan = plan(args, &cell, &folder)?;
-    say.plan(&plan);
+    console.plan(&plan);
 
-    say.step("waiting for the marks and the robot");
+    console.step("waiting for the marks and the robot");
     let tracking = |s: &TelemetrySample| s.state >= 1 && s.state != watch::FAULT;
     let ready = watch::until(&node, &mut cell, Duration::from_secs(20), |_| {}, tracking)?;
     if ready.seconds.is_none() {
@@ -70,30 +70,30 @@ pub fn run(args: &DemoArgs) -> Result<Exit, Failure> {
     ask(&client, Verb::Servo, b"")?;
 
     let _ = cell.pairs_per_second();
-    say.step("on line: servoing");
-    let bar = say.bar();
-    // A hold ends in armed, and only an operator would go on from there.
+    console.step("on-line stage: servoing");
+    let bar = console.bar();
+    // After a hold the daemon is armed, and only an operator may continue.
     let held = |s: &TelemetrySample| s.state == watch::ARMED && s.cause_text().starts_with("H-");
     let over = |s: &TelemetrySample| s.state == watch::CONVERGED || s.state == watch::FAULT || held(s);
     let outcome =
-        watch::until(&node, &mut cell, Duration::from_secs_f64(args.timeout), |s| say.progress(&bar, s), over)?;
+        watch::until(&node, &mut cell, Duration::from_secs_f64(args.timeout), |s| console.progress(&bar, s), over)?;
     bar.finish_and_clear();
     let outcome = settle(&node, &mut cell, outcome)?;
     let result = result::collect(args, &mut cell, &outcome)?;
-    // Whatever came of it, the arm is told to rest before anything ends.
+    // In every case the arm is stopped before the processes end.
     let _ = client.ask(Verb::Stop, b"", now_ns(), Duration::from_secs(2));
-    let result = result::close(result, &mut cell, &folder);
+    let result = result::close(result, &mut cell);
     if !args.headless {
         trajectories::draw(&folder, &outcome.trajectories)?;
     }
-    say.result(args, &result, &folder);
+    console.result(args, &result, &folder);
     if outcome.last.state == watch::FAULT {
         return Err(Failure::fault(outcome.last.cause_text().to_owned()));
     }
     Ok(if result.converged { Exit::Done } else { Exit::NotConverged })
 }
 
-/// Lets the converged loop hold for half a second: what is measured then is rest, not passage.
+/// Waits for half a second after convergence, so that the result is measured at rest.
 fn settle(node: &ShmNode, cell: &mut Cell, mut outcome: watch::Outcome) -> Result<watch::Outcome, Failure> {
     if outcome.seconds.is_some() && outcome.last.state == watch::CONVERGED {
         let start = Instant::now();
@@ -107,7 +107,7 @@ fn settle(node: &ShmNode, cell: &mut Cell, mut outcome: watch::Outcome) -> Resul
 }
 
 fn ask(client: &RequestClient, verb: Verb, payload: &[u8]) -> Result<(), Failure> {
-    // Readiness may need a moment after the marks are found: robot state and images have to have been good for a while.
+    // The daemon may become ready a little later: robot state and images have to be good for some time.
     let until = Instant::now() + Duration::from_secs(5);
     loop {
         let answer =
@@ -126,7 +126,7 @@ fn status(client: &RequestClient) -> String {
     client.ask(Verb::Status, b"", now_ns(), Duration::from_secs(1)).map_or_else(|e| e.to_string(), |a| a.json)
 }
 
-/// Saves one stereo pair as `left.png` and `right.png`, as an operator's console would freeze it.
+/// Saves one stereo pair as `left.png` and `right.png`.
 fn first_images(config: &crate::config::Config, names: &Names, folder: &Path) -> Result<(), Failure> {
     let node = create_node(names, "graspd-demo-images").map_err(|e| Failure::link(e.to_string()))?;
     let mut frames = FrameSubscriber::new(&node, FramePolicy::default()).map_err(|e| Failure::link(e.to_string()))?;
@@ -134,9 +134,9 @@ fn first_images(config: &crate::config::Config, names: &Names, folder: &Path) ->
     while Instant::now() < until {
         if let Some(frame) = frames.newest(now_ns()).frame {
             let (w, h) = (frame.width(), frame.height());
-            for (eye, name) in ["left.png", "right.png"].iter().enumerate() {
+            for (view, name) in ["left.png", "right.png"].iter().enumerate() {
                 let mut grey = vec![0; w * h];
-                if !frame.write_mono8(eye, &mut grey) {
+                if !frame.write_mono8(view, &mut grey) {
                     return Err(Failure::link("the scene's frames cannot be converted to grey"));
                 }
                 let path = folder.join(name);
@@ -149,14 +149,14 @@ fn first_images(config: &crate::config::Config, names: &Names, folder: &Path) ->
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-    Err(Failure::link("no stereo pair came from the scene within 10 s"))
+    Err(Failure::link("the scene published no stereo pair within 10 s"))
 }
 
-/// Runs `graspd plan` on the saved pair, as a process, with the world's scripted clicks.
+/// Runs `graspd plan` on the saved pair, as a process, with the clicks of the world's script.
 fn plan(args: &DemoArgs, cell: &Cell, folder: &Path) -> Result<serde_json::Value, Failure> {
     let program =
         std::env::current_exe().map_err(|e| Failure::link(format!("this program's own path is unknown ({e})")))?;
-    let click = |eye: usize| format!("{:.1},{:.1}", cell.scenario.clicks[eye].x, cell.scenario.clicks[eye].y);
+    let click = |view: usize| format!("{:.1},{:.1}", cell.scenario.clicks[view].x, cell.scenario.clicks[view].y);
     let mut command = Command::new(program);
     command.arg("plan").arg("--json").args(["--select-left", &click(0), "--select-right", &click(1)]);
     for (key, file) in [
@@ -175,33 +175,33 @@ fn plan(args: &DemoArgs, cell: &Cell, folder: &Path) -> Result<serde_json::Value
     }
     let output = command.output().map_err(|e| Failure::link(format!("graspd plan could not be started ({e})")))?;
     if !output.status.success() {
-        let said = String::from_utf8_lossy(&output.stderr);
-        return Err(Failure::refused(format!("no plan: {}", said.trim())));
+        let message = String::from_utf8_lossy(&output.stderr);
+        return Err(Failure::refused(format!("no plan: {}", message.trim())));
     }
     serde_json::from_slice(&output.stdout)
         .map_err(|e| Failure::link(format!("graspd plan --json printed no JSON ({e})")))
 }
 
-/// What the demo tells people; silent with --headless or --json.
+/// Progress and result on the terminal; disabled with --headless or --json.
 #[derive(Debug)]
-struct Say {
-    aloud: bool,
+struct Console {
+    enabled: bool,
     start: Instant,
 }
 
-impl Say {
+impl Console {
     fn new(args: &DemoArgs) -> Self {
-        Self { aloud: !args.headless && !args.json, start: Instant::now() }
+        Self { enabled: !args.headless && !args.json, start: Instant::now() }
     }
 
     fn step(&self, what: &str) {
-        if self.aloud {
+        if self.enabled {
             println!("{:6.1} s  {what}", self.start.elapsed().as_secs_f64());
         }
     }
 
     fn plan(&self, plan: &serde_json::Value) {
-        if !self.aloud {
+        if !self.enabled {
             return;
         }
         let get = |key: &str| plan.pointer(key).and_then(serde_json::Value::as_f64);
@@ -210,12 +210,15 @@ impl Say {
             get("/plan/object/sigma_centre_mm"),
             get("/plan/object/sigma_normal_deg"),
         ) {
-            println!("          rim of radius {:.1} mm, centre known to {c:.2} mm, axis to {n:.2} degrees", a * 1e3);
+            println!(
+                "          rim of radius {:.1} mm; standard deviation of the centre {c:.2} mm, of the axis {n:.2} degrees",
+                a * 1e3
+            );
         }
     }
 
     fn bar(&self) -> ProgressBar {
-        if !self.aloud {
+        if !self.enabled {
             return ProgressBar::hidden();
         }
         let bar = ProgressBar::with_draw_target(Some(1000), ProgressDrawTarget::stderr());
@@ -232,8 +235,8 @@ impl Say {
             _ => watch::STATES.get(s.state as usize).copied().unwrap_or(""),
         };
         let left = if s.distance_m.is_finite() { s.distance_m } else { 0.5 };
-        let whole = 0.5_f64;
-        bar.set_position((1000.0 * (1.0 - (left / whole).clamp(0.0, 1.0))) as u64);
+        let full_m = 0.5_f64;
+        bar.set_position((1000.0 * (1.0 - (left / full_m).clamp(0.0, 1.0))) as u64);
         bar.set_message(format!(
             "{phase}: {:.1} mm and {:.2} deg left, {:.2} px",
             s.distance_m * 1e3,

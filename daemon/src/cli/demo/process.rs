@@ -1,4 +1,4 @@
-//! The demo's parts, each a process of its own: started, waited for, ended by id, never left behind.
+//! The processes of the demo: started, awaited, and ended by their id when dropped.
 
 use crate::exit::Failure;
 use rustix::process::{Pid, Signal, kill_process};
@@ -9,17 +9,17 @@ use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
-/// A running part of the demo. Dropping it ends the process: first asked, then killed.
+/// A process of the demo. Dropping it ends the process, by SIGTERM and then by SIGKILL.
 #[derive(Debug)]
-pub(super) struct Part {
+pub(super) struct DemoProcess {
     name: &'static str,
     child: Child,
     stdin: Option<ChildStdin>,
     lines: Receiver<String>,
 }
 
-impl Part {
-    /// Starts a part: this very program with other arguments. Its standard error goes to `NAME.log` in `folder`.
+impl DemoProcess {
+    /// Starts this program with other arguments. Standard error goes to `NAME.log` in `folder`.
     ///
     /// # Errors
     /// When the program or its log cannot be opened.
@@ -56,7 +56,7 @@ impl Part {
     /// The next line of its standard output that is a JSON object.
     ///
     /// # Errors
-    /// When the part ended, or said nothing for `timeout`.
+    /// When the process ended, or printed no such line within `timeout`.
     pub(super) fn json_line(&mut self, timeout: Duration) -> Result<serde_json::Value, Failure> {
         let until = Instant::now() + timeout;
         loop {
@@ -69,7 +69,7 @@ impl Part {
                 }
                 Err(RecvTimeoutError::Timeout) => {
                     return Err(Failure::link(format!(
-                        "{} said nothing for {:.0} s; see its log",
+                        "{} printed nothing for {:.0} s; see its log",
                         self.name,
                         timeout.as_secs_f64()
                     )));
@@ -82,33 +82,33 @@ impl Part {
         }
     }
 
-    /// Sends a line to its standard input and waits for the JSON object it answers with.
+    /// Sends a line to its standard input and waits for the JSON object that answers it.
     ///
     /// # Errors
-    /// As [`Part::json_line`], and when the pipe is broken.
+    /// As [`DemoProcess::json_line`], and when the pipe is broken.
     pub(super) fn ask(&mut self, line: &str, timeout: Duration) -> Result<serde_json::Value, Failure> {
         while self.lines.try_recv().is_ok() {}
-        let pipe = self.stdin.as_mut().ok_or_else(|| Failure::link(format!("{} takes no questions", self.name)))?;
+        let pipe = self.stdin.as_mut().ok_or_else(|| Failure::link(format!("{} has no standard input", self.name)))?;
         writeln!(pipe, "{line}")
             .and_then(|()| pipe.flush())
-            .map_err(|e| Failure::link(format!("{} does not listen ({e})", self.name)))?;
+            .map_err(|e| Failure::link(format!("{} does not read its standard input ({e})", self.name)))?;
         self.json_line(timeout)
     }
 
-    /// Whether it ended, and how.
+    /// Its exit status, if it has ended.
     pub(super) fn ended(&mut self) -> Option<ExitStatus> {
         self.child.try_wait().ok().flatten()
     }
 
-    /// Asks it to end and waits; kills it when it does not. Its exit status, if it had one.
-    pub(super) fn end(&mut self, patience: Duration) -> Option<ExitStatus> {
+    /// Ends it by SIGTERM, and by SIGKILL after `timeout`. Returns its exit status, if it had one.
+    pub(super) fn end(&mut self, timeout: Duration) -> Option<ExitStatus> {
         if let Some(status) = self.ended() {
             return Some(status);
         }
         if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw) {
             let _ = kill_process(pid, Signal::TERM);
         }
-        let until = Instant::now() + patience;
+        let until = Instant::now() + timeout;
         while Instant::now() < until {
             if let Some(status) = self.ended() {
                 return Some(status);
@@ -120,7 +120,7 @@ impl Part {
     }
 }
 
-impl Drop for Part {
+impl Drop for DemoProcess {
     fn drop(&mut self) {
         self.end(Duration::from_secs(2));
     }

@@ -1,4 +1,5 @@
-//! What came of the demo: the scene's word on the error, the mock's word on the limits, the daemon's on its timing.
+//! The result of the demo: the error by the scene's ground truth, limit violations by the mock controller, timing by
+//! the daemon.
 
 use super::cell::Cell;
 use super::watch::{CONVERGED, Outcome};
@@ -6,7 +7,6 @@ use crate::cli::DemoArgs;
 use crate::exit::Failure;
 use graspd_shm::control::Percentiles;
 use serde_json::{Value, json};
-use std::path::Path;
 use std::time::Duration;
 
 /// The result, as printed.
@@ -14,31 +14,31 @@ use std::time::Duration;
 pub(super) struct DemoResult {
     /// Seed of the world.
     pub seed: u64,
-    /// Whether the daemon said that it converged.
+    /// Whether the daemon reported convergence.
     pub converged: bool,
-    /// True distance of the gripper from where it should be, by the scene.
+    /// True distance of the gripper from the planned pose, by the scene.
     pub position_error_mm: f64,
     /// True angle between the gripper's approach and the valve's axis, by the scene.
     pub orientation_error_deg: f64,
-    /// From the start of servoing to convergence.
+    /// Time from the start of servoing to convergence.
     pub convergence_s: Option<f64>,
-    /// Cycles of the command thread, and those that came a whole period late.
+    /// Cycles of the command thread, and those that were a whole period late.
     pub cycles: (u64, u64),
     /// Pairs tracked.
     pub frames: u64,
-    /// Pairs a second that the scene published while the arm was servoed.
+    /// Pairs a second that the scene published during servoing.
     pub pairs_per_s: Option<f64>,
-    /// Set-points on the wire that broke a limit, by the mock controller; `None` when it could not say.
+    /// Set-points on the wire that exceeded a limit, by the mock controller; `None` when it gave no summary.
     pub limit_violations: Option<u64>,
-    /// Wake-up, computing, frame to command, round trip.
+    /// Wake-up, computation, frame to command, round trip.
     pub timing: [Percentiles; 4],
-    /// Residual of the marks at rest: the calibration's health.
+    /// Residual of the marks at rest, which shows errors of the calibration.
     pub residual_px: f64,
-    /// State and cause at the end.
+    /// Final state and its cause.
     pub state: String,
 }
 
-/// Asks the scene for the truth and the daemon's telemetry for the rest.
+/// Takes the error from the scene and the other values from the daemon's telemetry.
 ///
 /// # Errors
 /// When the scene does not answer.
@@ -48,7 +48,7 @@ pub(super) fn collect(args: &DemoArgs, cell: &mut Cell, outcome: &Outcome) -> Re
     let number = |key: &str| truth.pointer(key).and_then(Value::as_f64);
     let (position, orientation) = (number("/grasp/position_error_mm"), number("/grasp/orientation_error_deg"));
     let (Some(position_error_mm), Some(orientation_error_deg)) = (position, orientation) else {
-        return Err(Failure::link(format!("the scene does not say how far the gripper is: {truth}")));
+        return Err(Failure::link(format!("the scene's answer has no grasp error: {truth}")));
     };
     Ok(DemoResult {
         seed: args.seed,
@@ -73,13 +73,13 @@ pub(super) fn collect(args: &DemoArgs, cell: &mut Cell, outcome: &Outcome) -> Re
     })
 }
 
-/// Ends the parts in order and takes the mock controller's summary of the wire.
-pub(super) fn close(mut result: DemoResult, cell: &mut Cell, _folder: &Path) -> DemoResult {
-    let patience = Duration::from_secs(3);
-    cell.daemon.end(patience);
-    cell.scene.end(patience);
-    // Its last words are the oracle's summary of everything that came over the wire.
-    cell.mock.end(patience);
+/// Ends the processes in order and takes the mock controller's summary of the wire.
+pub(super) fn close(mut result: DemoResult, cell: &mut Cell) -> DemoResult {
+    let timeout = Duration::from_secs(3);
+    cell.daemon.end(timeout);
+    cell.scene.end(timeout);
+    // Its last line is the summary of everything on the wire.
+    cell.mock.end(timeout);
     while let Ok(line) = cell.mock.json_line(Duration::from_millis(200)) {
         if let Some(n) = line.pointer("/summary/limit_violations") {
             result.limit_violations = n.as_u64();
@@ -127,12 +127,12 @@ impl DemoResult {
         let _ = writeln!(out, "\n{verdict} in {seconds}; {}", self.state);
         let _ = writeln!(
             out,
-            "true error   {:8.3} mm   {:8.3} degrees   (the scene's word)",
+            "true error   {:8.3} mm   {:8.3} degrees   (ground truth from the scene)",
             self.position_error_mm, self.orientation_error_deg
         );
         let _ = writeln!(
             out,
-            "at rest      {:8.3} px   residual of the marks: health of the calibration",
+            "at rest      {:8.3} px   residual of the marks (error of the calibration)",
             self.residual_px
         );
         let _ = writeln!(

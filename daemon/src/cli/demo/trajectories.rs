@@ -1,4 +1,4 @@
-//! The ways of the marks in both images during the servo: the paper's figure 8.
+//! Drawing of the image trajectories of the marks during servoing, as in figure 8 of the paper.
 
 use super::watch::Trajectories;
 use crate::exit::Failure;
@@ -6,12 +6,14 @@ use graspd_calib::offline::drawing::canvas::{Canvas, Face, Rgba};
 use graspd_rt::geom::Pixel;
 use std::path::Path;
 
-/// Height of the strip with the title and the error curve under the images, px.
+/// Height of the title above the images, px.
 const TITLE: f64 = 46.0;
+/// Height of the error curve below the images, px.
 const CURVE: f64 = 190.0;
+/// Space between the parts, px.
 const GAP: f64 = 8.0;
 
-/// Distinct, bright colours, one a mark.
+/// Distinct, bright colours of the marks.
 const COLOURS: [Rgba; 10] = [
     [255, 99, 71, 255],
     [80, 200, 255, 255],
@@ -41,17 +43,17 @@ pub(super) fn draw(folder: &Path, t: &Trajectories) -> Result<(), Failure> {
     let (vw, vh) = (800.0, (h * scale).round());
     let (width, height) = (2.0 * vw + 3.0 * GAP, TITLE + vh + CURVE + 2.0 * GAP);
     let mut canvas =
-        Canvas::new(width as u32, height as u32, [16, 18, 24, 255]).ok_or_else(|| fail("no memory".into()))?;
-    let at = |eye: usize, p: [f32; 2]| {
+        Canvas::new(width as u32, height as u32, [16, 18, 24, 255]).ok_or_else(|| fail("out of memory".into()))?;
+    let at = |view: usize, p: [f32; 2]| {
         (p[0].is_finite() && p[1].is_finite()).then(|| {
-            Pixel::new(GAP + eye as f64 * (vw + GAP) + f64::from(p[0]) * scale, TITLE + f64::from(p[1]) * scale)
+            Pixel::new(GAP + view as f64 * (vw + GAP) + f64::from(p[0]) * scale, TITLE + f64::from(p[1]) * scale)
         })
     };
-    for (eye, image) in images.iter().enumerate() {
-        place(&mut canvas, image, GAP + eye as f64 * (vw + GAP), vw as u32, vh as u32);
-        for (i, way) in t.points[eye].iter().enumerate() {
+    for (view, image) in images.iter().enumerate() {
+        place(&mut canvas, image, GAP + view as f64 * (vw + GAP), vw as u32, vh as u32);
+        for (i, trajectory) in t.points[view].iter().enumerate() {
             let colour = COLOURS[i % COLOURS.len()];
-            let points: Vec<Option<Pixel>> = way.iter().map(|p| at(eye, *p)).collect();
+            let points: Vec<Option<Pixel>> = trajectory.iter().map(|p| at(view, *p)).collect();
             canvas.line(&points, [10, 12, 16, 200], 4.0, None);
             canvas.line(&points, colour, 2.0, None);
             for p in points.iter().flatten().step_by(10) {
@@ -60,7 +62,7 @@ pub(super) fn draw(folder: &Path, t: &Trajectories) -> Result<(), Failure> {
             if let Some(first) = points.iter().flatten().next() {
                 canvas.ring(*first, 6.0, colour, 2.0);
             }
-            if let Some(goal) = t.goals[eye].get(i).and_then(|g| at(eye, *g)) {
+            if let Some(goal) = t.goals[view].get(i).and_then(|g| at(view, *g)) {
                 let (d, white) = (7.0, [255, 255, 255, 255]);
                 canvas.segment(goal - Pixel::new(d, 0.0), goal + Pixel::new(d, 0.0), white, 1.6);
                 canvas.segment(goal - Pixel::new(0.0, d), goal + Pixel::new(0.0, d), white, 1.6);
@@ -71,20 +73,20 @@ pub(super) fn draw(folder: &Path, t: &Trajectories) -> Result<(), Failure> {
     let ink = [226, 230, 238, 255];
     canvas.text(
         Pixel::new(GAP + 4.0, 12.0),
-        "Ways of the gripper's marks: ring = start, dot = every 0.2 s, cross = set-point",
+        "Image trajectories of the gripper's marks: ring = start, dot = every 0.2 s, cross = set-point",
         Face::Bold,
         1,
         ink,
     );
-    for (eye, name) in ["left", "right"].iter().enumerate() {
-        canvas.label(Pixel::new(GAP + eye as f64 * (vw + GAP) + 34.0, TITLE + 16.0), name, Face::Bold, 1, ink);
+    for (view, name) in ["left", "right"].iter().enumerate() {
+        canvas.label(Pixel::new(GAP + view as f64 * (vw + GAP) + 34.0, TITLE + 16.0), name, Face::Bold, 1, ink);
     }
     curve(&mut canvas, t, TITLE + vh + GAP, width);
     let png = canvas.png().ok_or_else(|| fail("encoding failed".into()))?;
     std::fs::write(&out, png).map_err(|e| fail(e.to_string()))
 }
 
-/// A grey image, dimmed so that lines stand out.
+/// Draws a grey image, dimmed for contrast with the lines.
 fn place(canvas: &mut Canvas, image: &image::GrayImage, x: f64, width: u32, height: u32) {
     let small = image::imageops::resize(image, width, height, image::imageops::FilterType::Triangle);
     let Some(mut view) = Canvas::new(width, height, [0, 0, 0, 255]) else { return };
@@ -92,7 +94,7 @@ fn place(canvas: &mut Canvas, image: &image::GrayImage, x: f64, width: u32, heig
     canvas.place(x as i32, TITLE as i32, &view);
 }
 
-/// The image error over time, logarithmic: what the loop makes of it.
+/// Draws the image error over time on a logarithmic scale.
 fn curve(canvas: &mut Canvas, t: &Trajectories, top: f64, width: f64) {
     let (left, right, bottom) = (70.0, width - 20.0, top + CURVE - 34.0);
     let ink = [150, 158, 172, 255];

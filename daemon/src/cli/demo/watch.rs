@@ -1,4 +1,4 @@
-//! What the demo sees of the daemon: telemetry, for progress, for the table and for the image of the marks' ways.
+//! The daemon's telemetry: for the progress display, the result and the drawing of the image trajectories.
 
 use super::cell::Cell;
 use crate::exit::Failure;
@@ -6,37 +6,37 @@ use graspd_shm::ShmNode;
 use graspd_shm::control::{TelemetrySample, TelemetrySubscriber};
 use std::time::{Duration, Instant};
 
-/// Words of the telemetry's state number.
+/// Names of the telemetry's state numbers.
 pub(super) const STATES: [&str; 7] = ["idle", "tracking", "armed", "servoing", "converged", "stopping", "fault"];
 
-/// State number of an armed daemon.
+/// State number of mode armed.
 pub(super) const ARMED: u32 = 2;
-/// State number of a converged daemon.
+/// State number of mode converged.
 pub(super) const CONVERGED: u32 = 4;
-/// State number of a fault.
+/// State number of mode fault.
 pub(super) const FAULT: u32 = 6;
 
-/// The ways of the marks in both images, a sample every 20 ms.
+/// Image trajectories of the marks in both views, with a sample every 20 ms.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Trajectories {
     /// By view, mark and time, px; NaN where not seen.
     pub points: [Vec<Vec<[f32; 2]>>; 2],
-    /// By view and mark, px: where they had to go.
+    /// By view and mark, px: the position at the goal.
     pub goals: [Vec<[f32; 2]>; 2],
-    /// Image error by time: seconds since the start, px.
+    /// Time since the start, s, and image error, px.
     pub errors: Vec<(f64, f64)>,
 }
 
 impl Trajectories {
     fn add(&mut self, sample: &TelemetrySample, seconds: f64) {
         let n = (sample.mark_count as usize).min(sample.marks[0].len());
-        for eye in 0..2 {
-            self.points[eye].resize(n, Vec::new());
-            self.goals[eye].resize(n, [f32::NAN; 2]);
+        for view in 0..2 {
+            self.points[view].resize(n, Vec::new());
+            self.goals[view].resize(n, [f32::NAN; 2]);
             for i in 0..n {
-                self.points[eye][i].push(sample.marks[eye][i]);
-                if sample.goals[eye][i][0].is_finite() {
-                    self.goals[eye][i] = sample.goals[eye][i];
+                self.points[view][i].push(sample.marks[view][i]);
+                if sample.goals[view][i][0].is_finite() {
+                    self.goals[view][i] = sample.goals[view][i];
                 }
             }
         }
@@ -44,21 +44,21 @@ impl Trajectories {
     }
 }
 
-/// The end of a watch.
+/// The result of [`until`].
 #[derive(Clone, Debug)]
 pub(super) struct Outcome {
     /// The last sample.
     pub last: TelemetrySample,
-    /// Seconds from the start of servoing to convergence at the last goal.
+    /// Time until the condition was true, s; `None` after a timeout.
     pub seconds: Option<f64>,
-    /// The marks' ways.
+    /// The trajectories of the marks.
     pub trajectories: Trajectories,
 }
 
-/// Reads telemetry until `done` says so of a sample, at most `timeout`. `each` sees every sample.
+/// Reads telemetry until `done` is true for a sample, at most for `timeout`. `each` is called with every sample.
 ///
 /// # Errors
-/// A part that ended, telemetry that fails.
+/// A process that ended, or telemetry that fails.
 pub(super) fn until(
     node: &ShmNode,
     cell: &mut Cell,
@@ -69,10 +69,10 @@ pub(super) fn until(
     let subscriber = TelemetrySubscriber::new(node).map_err(|e| Failure::link(e.to_string()))?;
     let start = Instant::now();
     let mut out = Outcome { last: TelemetrySample::default(), seconds: None, trajectories: Trajectories::default() };
-    let mut heard = false;
+    let mut received = false;
     while start.elapsed() < timeout {
         while let Some(sample) = subscriber.next().map_err(|e| Failure::link(e.to_string()))? {
-            heard = true;
+            received = true;
             let seconds = start.elapsed().as_secs_f64();
             out.trajectories.add(&sample, seconds);
             out.last = sample;
@@ -82,12 +82,12 @@ pub(super) fn until(
                 return Ok(out);
             }
         }
-        if let Some(who) = cell.dead_part() {
-            return Err(Failure::link(format!("{who}; its log stands in the demo's folder")));
+        if let Some(process) = cell.dead_process() {
+            return Err(Failure::link(format!("{process}; see its log in the demo's folder")));
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-    if !heard {
+    if !received {
         return Err(Failure::link("the daemon publishes no telemetry"));
     }
     Ok(out)

@@ -1,5 +1,5 @@
-//! The runtime folder's side of the stop path: a lock that says which process is the daemon, and the socket it listens
-//! on.
+//! The stop path's files in the runtime folder: the lock that identifies the daemon's process, and the socket on which
+//! it listens.
 
 use crate::exit::Failure;
 use graspd_shm::Names;
@@ -10,7 +10,7 @@ use std::os::fd::{AsRawFd, OwnedFd};
 use std::os::unix::net::UnixListener;
 use std::path::PathBuf;
 
-/// Connections that may wait to be accepted.
+/// Maximum number of connections that wait to be accepted.
 const BACKLOG: i32 = 64;
 
 /// Name of a cell's stop socket in the runtime folder.
@@ -18,26 +18,26 @@ pub fn socket_name(cell: &str) -> String {
     format!("{cell}.stop")
 }
 
-/// Name of the file that the daemon holds locked and that carries its process number.
+/// Name of the file that the daemon locks and that contains its process id.
 pub(super) fn lock_name(cell: &str) -> String {
     format!("{cell}.pid")
 }
 
-/// The runtime folder, opened without following a link in its place; owner and mode are checked by the caller.
+/// Opens the runtime folder without following a symbolic link. The caller checks owner and mode.
 pub(super) fn open_folder(names: &Names) -> Result<OwnedFd, Errno> {
     let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
     rustix::fs::open(names.root(), flags, Mode::empty())
 }
 
-/// An address below an open folder: short whatever the folder's path is (a socket's address holds 107 bytes), and no
-/// other folder can be put in its place.
+/// Socket address in an open folder: short for every folder path (an address holds 107 bytes), and always in this very
+/// folder, also when its path is replaced.
 pub(super) fn address(folder: &OwnedFd, name: &str) -> Result<SocketAddrUnix, Errno> {
     SocketAddrUnix::new(format!("/proc/self/fd/{}/{name}", folder.as_raw_fd()))
 }
 
-/// The daemon's lock and listening socket. Dropping it removes the socket.
+/// The daemon's lock and its listening socket. Dropping it removes the socket.
 #[derive(Debug)]
-pub struct Door {
+pub struct StopEndpoint {
     folder: OwnedFd,
     lock: OwnedFd,
     socket: String,
@@ -45,15 +45,16 @@ pub struct Door {
     listener: Option<UnixListener>,
 }
 
-impl Door {
-    /// Takes the cell's lock and listens.
+impl StopEndpoint {
+    /// Takes the cell's lock and starts to listen.
     ///
     /// # Errors
     /// Another daemon runs in this cell, or the folder cannot be used.
-    pub fn open(names: &Names) -> Result<Door, Failure> {
+    pub fn open(names: &Names) -> Result<StopEndpoint, Failure> {
         let shown = names.root().display();
-        let fail =
-            |what: &str, e: Errno| Failure::link(format!("{shown}: {what} ({e}); is the folder yours and writable?"));
+        let fail = |what: &str, e: Errno| {
+            Failure::link(format!("{shown}: {what} ({e}); check that you own the folder and can write to it"))
+        };
         let folder = open_folder(names).map_err(|e| fail("the runtime folder cannot be opened", e))?;
         let (socket, lock_file) = (socket_name(names.cell()), lock_name(names.cell()));
         let flags = OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::CLOEXEC;
@@ -64,41 +65,41 @@ impl Door {
             Err(Errno::WOULDBLOCK) => {
                 let pid = read_pid(&lock).map_or_else(String::new, |pid| format!(" (process {pid})"));
                 return Err(Failure::link(format!(
-                    "another daemon{pid} runs in cell '{}'; end it first, or give this one another cell",
+                    "another daemon{pid} runs in cell '{}'; end it first, or set another cell",
                     names.cell()
                 )));
             }
             Err(e) => return Err(fail(&format!("{lock_file} cannot be locked"), e)),
         }
         let listener = listen_at(&folder, &socket).map_err(|e| fail(&format!("{socket} cannot be listened on"), e))?;
-        // The number is written last: who reads it finds a daemon that listens.
+        // The process id is written last, so that a client that reads it finds a listening daemon.
         let text = format!("{}\n", std::process::id());
         rustix::fs::ftruncate(&lock, 0)
             .and_then(|()| rustix::io::pwrite(&lock, text.as_bytes(), 0))
             .map_err(|e| fail(&format!("{lock_file} cannot be written"), e))?;
         let paths = [names.root().join(&socket), names.root().join(&lock_file)];
-        Ok(Door { folder, lock, socket, paths, listener: Some(listener) })
+        Ok(StopEndpoint { folder, lock, socket, paths, listener: Some(listener) })
     }
 
-    /// The listening socket, once: for the stop thread.
+    /// The listening socket, for the stop thread; `None` from the second call on.
     pub fn listener(&mut self) -> Option<UnixListener> {
         self.listener.take()
     }
 
-    /// Socket and lock file: without them nobody finds the daemon.
+    /// Socket and lock file: clients find the daemon by them.
     pub fn paths(&self) -> &[PathBuf] {
         &self.paths
     }
 }
 
-impl Drop for Door {
+impl Drop for StopEndpoint {
     fn drop(&mut self) {
         let _ = unlinkat(&self.folder, self.socket.as_str(), AtFlags::empty());
         let _ = rustix::fs::ftruncate(&self.lock, 0);
     }
 }
 
-/// Takes the lock; a client that looks whether it is held holds it for a moment itself.
+/// Takes the lock. Tries for 0.2 s, because a client that tests the lock holds it for a moment.
 fn take_lock(lock: &OwnedFd) -> Result<(), Errno> {
     for _ in 0..20 {
         match flock(lock, FlockOperation::NonBlockingLockExclusive) {
@@ -109,7 +110,8 @@ fn take_lock(lock: &OwnedFd) -> Result<(), Errno> {
     flock(lock, FlockOperation::NonBlockingLockExclusive)
 }
 
-/// Listens below the folder. Whatever stands there under this name is a dead daemon's: the lock is ours.
+/// Listens on a socket in the folder. An existing one of this name is removed: it belongs to a dead daemon, because we
+/// hold the lock.
 fn listen_at(folder: &OwnedFd, name: &str) -> Result<UnixListener, Errno> {
     match unlinkat(folder, name, AtFlags::empty()) {
         Ok(()) | Err(Errno::NOENT) => {}
@@ -118,25 +120,25 @@ fn listen_at(folder: &OwnedFd, name: &str) -> Result<UnixListener, Errno> {
     let socket =
         socket_with(AddressFamily::UNIX, SocketType::STREAM, SocketFlags::CLOEXEC | SocketFlags::NONBLOCK, None)?;
     bind(&socket, &address(folder, name)?)?;
-    // Nobody can connect before `listen`, so that the mode is right from the first connection on.
+    // No connection is possible before `listen`, so that the mode applies to the first one already.
     chmodat(folder, name, Mode::from_raw_mode(0o600), AtFlags::empty())?;
     listen(&socket, BACKLOG)?;
     Ok(UnixListener::from(socket))
 }
 
-/// The process number in a lock file.
+/// The process id in a lock file.
 pub(super) fn read_pid(lock: &OwnedFd) -> Option<i32> {
     let mut text = [0u8; 16];
     let n = rustix::io::pread(lock, &mut text, 0).ok()?;
     std::str::from_utf8(text.get(..n)?).ok()?.trim().parse().ok().filter(|pid| *pid > 1)
 }
 
-/// Owner of the folder, and whether `name` in it is a socket of that owner.
+/// User id of the folder's owner.
 pub(super) fn owner(folder: &OwnedFd) -> Result<u32, Errno> {
     fstat(folder).map(|st| st.st_uid)
 }
 
-/// Whether there is anything of this name in the folder.
+/// Whether the folder has an entry of this name.
 pub(super) fn exists(folder: &OwnedFd, name: &str) -> bool {
     statat(folder, name, AtFlags::SYMLINK_NOFOLLOW).is_ok()
 }
