@@ -7,4 +7,5 @@ mod numbers;
 pub mod plant;
 pub mod scenario;
 pub mod scene;
+pub mod scene_program;
 pub mod urscript;

@@ -1,53 +1,13 @@
 //! The robot as a script sees it.
 
 use super::message::MessageKind;
+use super::registers::Registers;
 use super::robot::Robot;
 use crate::plant::{self, pose_to_vector, vector_to_pose};
 use crate::urscript::{
     Bank, Connect, Host, HostError, JointVector, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup, PoseVector,
     Received, RobotView, Target, Value, WatchdogAction,
 };
-use std::collections::HashMap;
-use std::io::{ErrorKind, Read, Write};
-use std::net::{TcpStream, ToSocketAddrs};
-use std::sync::mpsc::{Receiver, TryRecvError, channel};
-use std::time::Duration;
-
-/// Connections that a script may hold at a time.
-const MOST_SOCKETS: usize = 8;
-
-/// Connections opened by the running program.
-#[derive(Default)]
-pub(super) struct Sockets(HashMap<String, Socket>);
-
-enum Socket {
-    /// A helper thread connects, for two seconds at most.
-    Connecting(Receiver<Option<TcpStream>>),
-    Open(TcpStream),
-}
-
-impl Sockets {
-    pub(super) fn close_all(&mut self) {
-        self.0.clear();
-    }
-}
-
-/// Connects without ever making the control step wait.
-fn connect(address: &str, port: u16) -> Receiver<Option<TcpStream>> {
-    let (tell, hear) = channel();
-    let address = address.to_owned();
-    std::thread::spawn(move || {
-        let stream = (address.as_str(), port)
-            .to_socket_addrs()
-            .ok()
-            .and_then(|mut all| all.next())
-            .and_then(|a| TcpStream::connect_timeout(&a, Duration::from_secs(2)).ok())
-            .filter(|s| s.set_nonblocking(true).is_ok() && s.set_nodelay(true).is_ok());
-        // The script may have given up; then the connection closes here.
-        let _ = tell.send(stream);
-    });
-    hear
-}
 
 fn bit(kind: OutputKind, index: usize) -> u32 {
     let base = match kind {
@@ -286,59 +246,24 @@ impl Host for Robot {
     }
 
     fn socket_connect(&mut self, name: &str, address: &str, port: u16) -> Connect {
-        let full = self.sockets.0.len() >= MOST_SOCKETS;
-        match self.sockets.0.get(name) {
-            Some(Socket::Open(_)) => Connect::Open,
-            Some(Socket::Connecting(hear)) => match hear.try_recv() {
-                Ok(Some(stream)) => {
-                    self.sockets.0.insert(name.to_owned(), Socket::Open(stream));
-                    Connect::Open
-                }
-                Err(TryRecvError::Empty) => Connect::Pending,
-                Ok(None) | Err(TryRecvError::Disconnected) => {
-                    self.sockets.0.remove(name);
-                    Connect::Failed
-                }
-            },
-            None if full => Connect::Failed,
-            None => {
-                self.sockets.0.insert(name.to_owned(), Socket::Connecting(connect(address, port)));
-                Connect::Pending
-            }
-        }
+        self.sockets.connect(name, address, port)
     }
 
     fn socket_close(&mut self, name: &str) {
-        self.sockets.0.remove(name);
+        self.sockets.close(name);
     }
 
     fn socket_send(&mut self, name: &str, bytes: &[u8]) -> bool {
-        let sent = match self.sockets.0.get_mut(name) {
-            Some(Socket::Open(stream)) => stream.write_all(bytes).is_ok(),
-            _ => false,
-        };
-        if !sent {
-            self.sockets.0.remove(name);
-        }
-        sent
+        self.sockets.send(name, bytes)
     }
 
     fn socket_receive(&mut self, name: &str) -> Received {
-        let Some(Socket::Open(stream)) = self.sockets.0.get_mut(name) else { return Received::Closed };
-        let mut buffer = [0; 4096];
-        match stream.read(&mut buffer) {
-            Ok(n) if n > 0 => Received::Bytes(buffer.iter().copied().take(n).collect()),
-            Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => Received::Nothing,
-            Ok(_) | Err(_) => {
-                self.sockets.0.remove(name);
-                Received::Closed
-            }
-        }
+        self.sockets.receive(name)
     }
 }
 
 impl Robot {
-    fn bank(&self, bank: Bank) -> &super::registers::Registers {
+    fn bank(&self, bank: Bank) -> &Registers {
         match bank {
             Bank::Input => &self.inputs,
             Bank::Output => &self.outputs,

@@ -48,3 +48,27 @@ pub struct WireFaults {
     /// New connections are refused.
     pub refuse: bool,
 }
+
+/// `seconds` (0 to 1e6) after `now_ns`.
+pub(super) fn later(now_ns: u64, seconds: f64) -> u64 {
+    now_ns.saturating_add((seconds.clamp(0.0, 1e6) * 1e9) as u64)
+}
+
+impl WireFaults {
+    /// Loses what clients send (`upstream`) and what the controller sends (`downstream`) for `seconds`.
+    pub(super) fn silence(&mut self, now_ns: u64, seconds: f64, upstream: bool, downstream: bool) {
+        let until = later(now_ns, seconds);
+        if upstream {
+            self.deaf_until = until;
+        }
+        if downstream {
+            self.mute_until = until;
+        }
+    }
+
+    /// Delays what the controller sends; both times are limited to one minute.
+    pub(super) fn delay(&mut self, ms: f64, jitter_ms: f64) {
+        self.delay_ns = (ms.clamp(0.0, 60_000.0) * 1e6) as u64;
+        self.jitter_ns = (jitter_ms.clamp(0.0, 60_000.0) * 1e6) as u64;
+    }
+}

@@ -1,35 +1,11 @@
 //! Programs on the controller: upload, play, pause, stop, and their turn in each control step.
 
 use super::message::MessageKind;
+use super::programs::{MAX_SECONDARY, Upload};
 use super::robot::{PROGRAM_STOP_DECEL, Robot};
 use super::state::{RobotMode, RuntimeState};
 use crate::plant::Motion;
-use crate::urscript::{Machine, ProgramKind, StepOutcome};
-
-/// Programs side by side (`sec`); more are refused.
-const MOST_SECONDARY: usize = 8;
-
-/// The main program and those beside it.
-#[derive(Default)]
-pub(super) struct Programs {
-    main: Option<Machine>,
-    /// Whether the main program is under way; false as soon as it is ended, even from inside its own step.
-    active: bool,
-    secondary: Vec<Machine>,
-    /// Name and text of the program that `play` starts.
-    loaded: Option<(String, String)>,
-}
-
-/// What became of a text sent to ports 30001 to 30003.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Upload {
-    /// It replaces the main program.
-    Main,
-    /// It runs beside the main program.
-    Secondary,
-    /// Refused, with the reason that the robot shows.
-    Refused(String),
-}
+use crate::urscript::{Machine, ProgramKind, StepOutcome, WatchdogAction};
 
 impl Robot {
     /// Whether the main program is playing: bit 1 of `robot_status_bits`.
@@ -48,7 +24,7 @@ impl Robot {
             }
         };
         if machine.kind() == ProgramKind::Secondary {
-            if self.programs.secondary.len() >= MOST_SECONDARY {
+            if self.programs.secondary.len() >= MAX_SECONDARY {
                 return Upload::Refused("too many secondary programs".to_owned());
             }
             self.programs.secondary.push(machine);
@@ -173,6 +149,23 @@ impl Robot {
             RuntimeState::Stopping if rest => self.runtime = RuntimeState::Stopped,
             RuntimeState::Pausing if rest => self.runtime = RuntimeState::Paused,
             _ => {}
+        }
+    }
+
+    /// Pauses or stops the program when an input went silent.
+    pub(super) fn check_watchdogs(&mut self) {
+        if self.deaf_watchdog || !self.is_program_running() {
+            return;
+        }
+        let Some((input, action)) = self.watchdogs.expired(self.clock_s) else { return };
+        let text = format!("RTDE watchdog: input '{input}' was not written in time");
+        self.say(MessageKind::Runtime { line: 0, column: 0, text });
+        match action {
+            WatchdogAction::Stop => self.stop_program(),
+            WatchdogAction::Pause => {
+                self.pause_program();
+            }
+            WatchdogAction::Ignore => {}
         }
     }
 }

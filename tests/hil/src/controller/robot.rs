@@ -1,9 +1,11 @@
 //! The whole robot in memory: arm, safety, program, registers. No socket, no clock: [`Robot::step`] is one control step.
 
+use super::memory::Memory;
 use super::message::{MessageKind, Outbox};
-use super::program::Programs;
+use super::programs::Programs;
 use super::registers::{Registers, Signals};
 use super::report::{Report, ReportFault};
+use super::sockets::Sockets;
 use super::state::{RobotMode, RuntimeState, SafetyMode};
 use super::watchdog::Watchdogs;
 use crate::plant::{Drives, Generator, Joints, Kinematics, Model, StopCause};
@@ -16,6 +18,9 @@ const DRIVE_ACCEL: f64 = 80.0;
 const PATH_TOLERANCE: f64 = 0.087;
 /// Deceleration when a program ends or is stopped, rad/s^2: the same as the stop in Universal Robots' control script.
 pub const PROGRAM_STOP_DECEL: f64 = 4.0;
+
+/// Message for a joint number that is out of range.
+pub(super) const JOINT_NUMBERS: &str = "joints are numbered 0 to 5";
 
 /// What a robot is when it starts.
 #[derive(Clone, Debug)]
@@ -122,10 +127,10 @@ pub struct Robot {
     pub(super) watchdogs: Watchdogs,
     pub(super) motion_left_s: Option<f64>,
     pub(super) motion_failure: Option<String>,
-    pub(super) sockets: super::host::Sockets,
-    pub(super) memory: super::questions::Memory,
-    safety_since_s: f64,
-    transition: Option<(f64, RobotMode)>,
+    pub(super) sockets: Sockets,
+    pub(super) memory: Memory,
+    pub(super) safety_since_s: f64,
+    pub(super) transition: Option<(f64, RobotMode)>,
     clock_offset_s: f64,
 }
 
@@ -163,15 +168,15 @@ impl Robot {
             watchdogs: Watchdogs::default(),
             motion_left_s: None,
             motion_failure: None,
-            sockets: super::host::Sockets::default(),
-            memory: super::questions::Memory::default(),
+            sockets: Sockets::default(),
+            memory: Memory::default(),
             safety_since_s: f64::NEG_INFINITY,
             transition: None,
             clock_offset_s: 0.0,
             setup,
         };
         robot.drives.set_brakes(robot.mode != RobotMode::Running);
-        robot.truth = Report::of(&robot);
+        robot.truth = robot.measure();
         robot.report = robot.truth.clone();
         robot
     }
@@ -185,7 +190,7 @@ impl Robot {
         self.run_programs();
         self.move_arm();
         self.settle_runtime();
-        self.truth = Report::of(self);
+        self.truth = self.measure();
         self.memory.note(&self.truth.actual_q, &self.truth.tcp_force);
         self.report = self.truth.distorted(&self.report_fault);
     }
@@ -256,139 +261,6 @@ impl Robot {
         self.stop_protectively(code, argument);
     }
 
-    /// Stops the arm as the safety system does; unlocking is refused for five seconds. The program is stopped.
-    pub fn stop_protectively(&mut self, code: i32, argument: i32) {
-        if self.safety.allows_motion() {
-            self.enter_safety(SafetyMode::ProtectiveStop, code, argument);
-            self.end_program();
-            self.generator.safety_stop();
-        }
-    }
-
-    /// Stops the arm with power kept and the program paused, until [`Robot::clear_safety`].
-    pub fn safeguard_stop(&mut self) {
-        if self.safety.allows_motion() {
-            self.enter_safety(SafetyMode::SafeguardStop, 0, 0);
-            if self.runtime == RuntimeState::Playing {
-                self.runtime = RuntimeState::Pausing;
-            }
-        }
-    }
-
-    /// Stops the arm, then takes the power away. `system` tells the emergency input from the pendant's button.
-    pub fn emergency_stop(&mut self, system: bool) {
-        let mode = if system { SafetyMode::SystemEmergencyStop } else { SafetyMode::RobotEmergencyStop };
-        self.enter_safety(mode, 0, 0);
-        self.end_program();
-        self.generator.safety_stop();
-        // Category 1: half a second of controlled stop, then no power.
-        self.transition = Some((self.clock_s + 0.5, RobotMode::PowerOff));
-    }
-
-    /// Brakes at once and takes the power away (category 0): a safety violation, or a fault of the safety system.
-    pub fn safety_failure(&mut self, fault: bool) {
-        self.enter_safety(if fault { SafetyMode::Fault } else { SafetyMode::Violation }, 0, 0);
-        self.end_program();
-        self.set_mode(RobotMode::PowerOff);
-    }
-
-    /// Sets or lifts reduced mode; no effect while stopped.
-    pub fn set_reduced(&mut self, on: bool) {
-        if self.safety.allows_motion() {
-            self.enter_safety(if on { SafetyMode::Reduced } else { SafetyMode::Normal }, 0, 0);
-        }
-        self.generator.set_reduced(on);
-    }
-
-    /// The emergency button is released, the safeguard closed. A protective stop or a fault is not cleared by this.
-    pub fn clear_safety(&mut self) {
-        if self.safety.is_emergency() || matches!(self.safety, SafetyMode::SafeguardStop | SafetyMode::Recovery) {
-            self.enter_safety(SafetyMode::Normal, 0, 0);
-        }
-    }
-
-    /// Unlocks a protective stop; refused in the first five seconds and when there is none.
-    pub fn unlock(&mut self) -> Result<(), &'static str> {
-        if self.safety != SafetyMode::ProtectiveStop {
-            return Ok(());
-        }
-        if self.clock_s - self.safety_since_s < 5.0 {
-            return Err(
-                "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop before unlocking",
-            );
-        }
-        self.enter_safety(SafetyMode::Normal, 0, 0);
-        Ok(())
-    }
-
-    /// Restarts the safety system after a fault or a violation; leaves the arm without power.
-    pub fn restart_safety(&mut self) {
-        self.end_program();
-        self.set_mode(RobotMode::PowerOff);
-        if !self.safety.is_emergency() {
-            self.enter_safety(SafetyMode::Normal, 0, 0);
-        }
-    }
-
-    fn enter_safety(&mut self, mode: SafetyMode, code: i32, argument: i32) {
-        if self.safety != mode {
-            self.safety = mode;
-            self.safety_since_s = self.clock_s;
-            self.say(MessageKind::Safety { code, argument, mode: mode as u8 });
-        }
-    }
-
-    /// Starts to power on; the arm ends with brakes on.
-    pub fn power_on(&mut self) -> bool {
-        if self.mode == RobotMode::PowerOff && !self.safety.is_emergency() && !self.safety_failed() {
-            self.set_mode(RobotMode::PowerOn);
-            self.transition = Some((self.clock_s + self.setup.power_time_s, RobotMode::Idle));
-        }
-        self.mode.is_powered()
-    }
-
-    /// Takes the power away.
-    pub fn power_off(&mut self) {
-        self.end_program();
-        self.set_mode(RobotMode::PowerOff);
-    }
-
-    /// Releases the brakes, powering on first where needed.
-    pub fn brake_release(&mut self) -> bool {
-        if self.safety.is_emergency() || self.safety_failed() {
-            return false;
-        }
-        if self.mode == RobotMode::PowerOff {
-            self.set_mode(RobotMode::PowerOn);
-        }
-        if matches!(self.mode, RobotMode::PowerOn | RobotMode::Idle) {
-            self.transition = Some((self.clock_s + self.setup.power_time_s, RobotMode::Running));
-        }
-        true
-    }
-
-    /// Sets the robot mode at once, as a fault does. Anything but running ends the program and sets the brakes.
-    pub fn set_mode(&mut self, mode: RobotMode) {
-        self.transition = None;
-        self.mode = mode;
-        self.drives.set_brakes(mode != RobotMode::Running);
-        if mode != RobotMode::Running {
-            self.end_program();
-        }
-    }
-
-    fn safety_failed(&self) -> bool {
-        matches!(self.safety, SafetyMode::Violation | SafetyMode::Fault)
-    }
-
-    fn advance_mode(&mut self) {
-        if let Some((at, mode)) = self.transition
-            && self.clock_s >= at
-        {
-            self.set_mode(mode);
-        }
-    }
-
     /// Puts the arm at `q`, at rest (faults B07 and B11, and the start of a test).
     pub fn teleport(&mut self, q: Joints) {
         let fault = *self.drives.fault();
@@ -403,6 +275,34 @@ impl Robot {
         let mut fault = *self.drives.fault();
         change(&mut fault);
         self.drives.set_fault(fault);
+    }
+
+    /// Puts a disturbance on one joint.
+    ///
+    /// # Errors
+    /// There is no such joint.
+    pub(super) fn set_joint_fault(
+        &mut self,
+        joint: usize,
+        change: impl FnOnce(&mut crate::plant::DriveFault),
+    ) -> Result<(), &'static str> {
+        if joint > 5 {
+            return Err(JOINT_NUMBERS);
+        }
+        self.set_drive_fault(change);
+        Ok(())
+    }
+
+    /// Sets the speed slider.
+    ///
+    /// # Errors
+    /// The fraction is outside 0 to 1.
+    pub(super) fn set_slider(&mut self, fraction: f64) -> Result<(), String> {
+        if !(0.0..=1.0).contains(&fraction) {
+            return Err(format!("speed slider {fraction} is outside 0 to 1"));
+        }
+        self.slider = fraction;
+        Ok(())
     }
 
     /// Whether targets and joints stand still.

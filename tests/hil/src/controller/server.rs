@@ -346,7 +346,7 @@ fn receive(c: &mut Connection, world: &mut World, buffer: &mut [u8], now: u64) {
                 for upload in uploads {
                     match upload {
                         Upload::Program(text) => {
-                            if let super::program::Upload::Refused(reason) = world.upload(now, &text) {
+                            if let super::programs::Upload::Refused(reason) = world.upload(now, &text) {
                                 tell(&format!("script refused: {reason}"));
                             }
                         }

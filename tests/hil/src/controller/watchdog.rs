@@ -1,9 +1,7 @@
 //! `rtde_set_watchdog`: an input that must be written often enough, or the program pauses or stops.
 
-use super::robot::Robot;
-use graspd_rt::rtde::Field;
-
 use crate::urscript::{HostError, WatchdogAction};
+use graspd_rt::rtde::Field;
 
 /// Watchdogs of the running program.
 #[derive(Clone, Debug, Default)]
@@ -65,29 +63,10 @@ impl Watchdogs {
     }
 
     /// The input and the action of a watchdog that has not been fed in time.
-    fn expired(&self, now_s: f64) -> Option<(Field, WatchdogAction)> {
+    pub(super) fn expired(&self, now_s: f64) -> Option<(Field, WatchdogAction)> {
         self.0
             .iter()
             .find(|w| w.action != WatchdogAction::Ignore && now_s - w.fed_s > w.period_s + 1e-9)
             .map(|w| (w.input, w.action))
-    }
-}
-
-impl Robot {
-    /// Pauses or stops the program when an input went silent.
-    pub(super) fn check_watchdogs(&mut self) {
-        if self.deaf_watchdog || !self.is_program_running() {
-            return;
-        }
-        let Some((input, action)) = self.watchdogs.expired(self.clock_s) else { return };
-        let text = format!("RTDE watchdog: input '{input}' was not written in time");
-        self.say(super::message::MessageKind::Runtime { line: 0, column: 0, text });
-        match action {
-            WatchdogAction::Stop => self.stop_program(),
-            WatchdogAction::Pause => {
-                self.pause_program();
-            }
-            WatchdogAction::Ignore => {}
-        }
     }
 }

@@ -2,14 +2,18 @@
 
 use super::command::{Command, Port, WireAction};
 use super::judge::{Judge, Limits, StepSample};
-use super::link_faults::{RtdeFaults, WireFaults};
-use super::program::Upload;
+use super::link_faults::{RtdeFaults, WireFaults, later};
+use super::programs::Upload;
 use super::record::Recorder;
-use super::robot::Robot;
+use super::report::ReportFault;
+use super::robot::{JOINT_NUMBERS, Robot};
 use super::rtde_session::{InputPackage, Ownership};
-use super::state::{RobotMode, SafetyMode};
+use crate::plant::DriveFault;
 use serde_json::{Value as Json, json};
 use std::collections::BTreeMap;
+
+/// Random bytes of one `garbage` command.
+const MAX_NOISE_BYTES: usize = 65_536;
 
 /// Everything behind the sockets.
 pub struct World {
@@ -148,7 +152,6 @@ impl World {
         if !is_query {
             self.note(now_ns, &format!("command {text}"));
         }
-        let until = |seconds: f64| now_ns.saturating_add((seconds.clamp(0.0, 1e6) * 1e9) as u64);
         let robot = &mut self.robot;
         match command {
             Command::Ping => {}
@@ -156,10 +159,7 @@ impl World {
             Command::Summary => return serde_json::to_value(self.judge.summary()).map_err(|e| e.to_string()),
             Command::Limits { rate, accel } => self.judge.set_client_limits(rate, accel),
             Command::ProtectiveStop => robot.stop_protectively(0, 0),
-            Command::Collision { force } => {
-                robot.external_wrench = [force, 0.0, 0.0, 0.0, 0.0, 0.0];
-                robot.stop_protectively(153, 0);
-            }
+            Command::Collision { force } => robot.collide(force),
             Command::EmergencyStop { system } => robot.emergency_stop(system),
             Command::SafeguardStop => robot.safeguard_stop(),
             Command::SafetyFailure { fault } => robot.safety_failure(fault),
@@ -168,46 +168,20 @@ impl World {
             Command::Reduced { on } => robot.set_reduced(on),
             Command::RobotMode { mode } => robot.set_mode(mode),
             Command::PowerOff => robot.power_off(),
-            Command::Restore => {
-                robot.safety = SafetyMode::Normal;
-                robot.set_mode(RobotMode::Running);
-            }
+            Command::Restore => robot.restore(),
             Command::RemoteControl { on } => robot.remote_control = on,
-            Command::SpeedSlider { fraction } if (0.0..=1.0).contains(&fraction) => robot.slider = fraction,
-            Command::SpeedSlider { fraction } => return Err(format!("speed slider {fraction} is outside 0 to 1")),
+            Command::SpeedSlider { fraction } => robot.set_slider(fraction)?,
             Command::PauseProgram => drop(robot.pause_program()),
-            Command::PlayProgram => {
-                if !robot.play() {
-                    return Err("there is no program to play".to_owned());
-                }
-            }
+            Command::PlayProgram => robot.play().then_some(()).ok_or("no program is loaded or paused")?,
             Command::StopProgram => robot.stop_program(),
-            Command::Script { text } => {
-                if let Upload::Refused(reason) = self.upload(now_ns, &text) {
-                    return Err(reason);
-                }
-            }
+            Command::Script { text } => self.upload(now_ns, &text).accepted()?,
             Command::NanPosition { joint } => robot.report_fault.nan_position = Some(joint),
             Command::NanSpeed { joint } => robot.report_fault.nan_speed = Some(joint),
-            Command::Jump { joint, rad, seconds } => {
-                let offset = robot.report_fault.offset.get_mut(joint).ok_or("joints are numbered 0 to 5")?;
-                *offset = rad;
-                self.jump_until = Some(robot.steps.saturating_add((seconds / robot.dt).max(1.0) as u64));
-            }
+            Command::Jump { joint, rad, seconds } => self.jump(joint, rad, seconds)?,
             Command::SwapJoints { a, b } => robot.report_fault.swapped = Some((a, b)),
-            Command::Drift { joint, rate } => {
-                if joint > 5 {
-                    return Err("joints are numbered 0 to 5".to_owned());
-                }
-                robot.set_drive_fault(|f| f.drift[joint] = rate);
-            }
+            Command::Drift { joint, rate } => robot.set_joint_fault(joint, |f| f.drift[joint] = rate)?,
             Command::Lag { seconds } => robot.set_drive_fault(|f| f.lag_s = seconds.clamp(0.0, 10.0)),
-            Command::Stuck { joint } => {
-                if joint > 5 {
-                    return Err("joints are numbered 0 to 5".to_owned());
-                }
-                robot.set_drive_fault(|f| f.stuck[joint] = true);
-            }
+            Command::Stuck { joint } => robot.set_joint_fault(joint, |f| f.stuck[joint] = true)?,
             Command::Teleport { q } => robot.teleport(q),
             Command::Payload { kg } => robot.payload.mass = kg,
             Command::Tcp { pose } => robot.tcp = pose,
@@ -225,48 +199,52 @@ impl World {
             Command::NotFound { names } => self.rtde_faults.not_found = names.into_iter().collect(),
             Command::WrongType { names } => self.rtde_faults.wrong_type = names.into_iter().collect(),
             Command::KeepOneOf { n } => self.rtde_faults.keep_one_of = n,
-            Command::Blackhole { port, seconds } => {
-                let wire = self.wire_faults.entry(port).or_default();
-                (wire.mute_until, wire.deaf_until) = (until(seconds), until(seconds));
-            }
-            Command::LoseUpstream { port, seconds } => {
-                self.wire_faults.entry(port).or_default().deaf_until = until(seconds);
-            }
-            Command::LoseDownstream { port, seconds } => {
-                self.wire_faults.entry(port).or_default().mute_until = until(seconds);
-            }
-            Command::Hold { port, seconds } => self.wire_faults.entry(port).or_default().hold_until = until(seconds),
-            Command::StopReading { port, seconds } => {
-                self.wire_faults.entry(port).or_default().unread_until = until(seconds);
-            }
-            Command::Delay { port, ms, jitter_ms } => {
-                let wire = self.wire_faults.entry(port).or_default();
-                wire.delay_ns = (ms.clamp(0.0, 60_000.0) * 1e6) as u64;
-                wire.jitter_ns = (jitter_ms.clamp(0.0, 60_000.0) * 1e6) as u64;
-            }
-            Command::Chunk { port, bytes } => self.wire_faults.entry(port).or_default().chunk = bytes,
-            Command::Refuse { port, on } => self.wire_faults.entry(port).or_default().refuse = on,
+            Command::Blackhole { port, seconds } => self.wire_fault(port).silence(now_ns, seconds, true, true),
+            Command::LoseUpstream { port, seconds } => self.wire_fault(port).silence(now_ns, seconds, true, false),
+            Command::LoseDownstream { port, seconds } => self.wire_fault(port).silence(now_ns, seconds, false, true),
+            Command::Hold { port, seconds } => self.wire_fault(port).hold_until = later(now_ns, seconds),
+            Command::StopReading { port, seconds } => self.wire_fault(port).unread_until = later(now_ns, seconds),
+            Command::Delay { port, ms, jitter_ms } => self.wire_fault(port).delay(ms, jitter_ms),
+            Command::Chunk { port, bytes } => self.wire_fault(port).chunk = bytes,
+            Command::Refuse { port, on } => self.wire_fault(port).refuse = on,
             Command::Reset { port } => self.actions.push(WireAction::Reset(port)),
             Command::Close { port } => self.actions.push(WireAction::Close(port)),
-            Command::Garbage { port, bytes } => {
-                let n = bytes.min(65_536);
-                let noise = (0..n).map(|_| (self.random() * 256.0) as u8).collect();
-                self.actions.push(WireAction::Inject(port, noise));
-            }
-            Command::WrongLength { port } => {
-                // Says two bytes, which is less than its own head.
-                self.actions.push(WireAction::Inject(port, vec![0, 2, 85]));
-            }
+            Command::Garbage { port, bytes } => self.inject_noise(port, bytes),
+            // A length of two bytes, less than the package header.
+            Command::WrongLength { port } => self.actions.push(WireAction::Inject(port, vec![0, 2, 85])),
             Command::UnknownType { port } => self.actions.push(WireAction::Inject(port, vec![0, 5, 0, 1, 2])),
-            Command::ClearFaults => {
-                robot.report_fault = super::report::ReportFault::default();
-                robot.set_drive_fault(|f| *f = crate::plant::DriveFault::default());
-                (robot.deaf_watchdog, robot.mute_outputs, robot.claimed_robot_type) = (false, false, None);
-                robot.external_wrench = [0.0; 6];
-                self.rtde_faults = RtdeFaults::default();
-                self.wire_faults.clear();
-            }
+            Command::ClearFaults => self.clear_faults(),
         }
         Ok(json!("done"))
+    }
+
+    fn wire_fault(&mut self, port: Port) -> &mut WireFaults {
+        self.wire_faults.entry(port).or_default()
+    }
+
+    /// Shifts the reported position of one joint by `rad` for `seconds`, one control step at least.
+    fn jump(&mut self, joint: usize, rad: f64, seconds: f64) -> Result<(), String> {
+        let offset = self.robot.report_fault.offset.get_mut(joint).ok_or(JOINT_NUMBERS)?;
+        *offset = rad;
+        self.jump_until = Some(self.robot.steps.saturating_add((seconds / self.robot.dt).max(1.0) as u64));
+        Ok(())
+    }
+
+    /// Sends random bytes between two packages of `port`.
+    fn inject_noise(&mut self, port: Port, bytes: usize) {
+        let n = bytes.min(MAX_NOISE_BYTES);
+        let noise = (0..n).map(|_| (self.random() * 256.0) as u8).collect();
+        self.actions.push(WireAction::Inject(port, noise));
+    }
+
+    /// Ends all faults except safety stops.
+    fn clear_faults(&mut self) {
+        let robot = &mut self.robot;
+        robot.report_fault = ReportFault::default();
+        robot.set_drive_fault(|f| *f = DriveFault::default());
+        (robot.deaf_watchdog, robot.mute_outputs, robot.claimed_robot_type) = (false, false, None);
+        robot.external_wrench = [0.0; 6];
+        self.rtde_faults = RtdeFaults::default();
+        self.wire_faults.clear();
     }
 }

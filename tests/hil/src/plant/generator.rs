@@ -1,122 +1,14 @@
 //! The controller half of motion: commands in, target joint positions out, one step at a time.
 
+use super::motion::{MAX_TARGET_ACCEL, Motion, REDUCED_SPEED_FRACTION, SAFETY_DECEL, StopCause};
 use super::path::CartesianPath;
 use super::profile::Profile;
 use super::{Joints, Kinematics, vector_to_pose};
 use nalgebra::{Isometry3, Vector3, Vector6};
 
-/// A motion command, as the URScript call of the same name gives it.
+/// The motion under way.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Motion {
-    /// `speedj`: reach and KEEP these joint rates (rad/s) until another motion; the leading axis accelerates at `accel`.
-    SpeedJ {
-        /// Joint rates, rad/s.
-        qd: Joints,
-        /// Acceleration of the leading axis, rad/s^2.
-        accel: f64,
-    },
-    /// `speedl`: reach and keep this tool velocity (linear then angular, base).
-    SpeedL {
-        /// m/s and rad/s.
-        twist: [f64; 6],
-        /// Linear acceleration, m/s^2.
-        accel: f64,
-        /// Angular acceleration, rad/s^2.
-        rot_accel: f64,
-    },
-    /// `servoj`: follow a joint position with about `lookahead` seconds of delay.
-    Servo {
-        /// Joint positions, rad.
-        q: Joints,
-        /// Smoothing time, s.
-        lookahead: f64,
-        /// Proportional gain; 300 is the default.
-        gain: f64,
-    },
-    /// `movej`: to joint positions, straight in joint space.
-    MoveJ {
-        /// Joint positions, rad.
-        q: Joints,
-        /// rad/s^2.
-        accel: f64,
-        /// rad/s.
-        speed: f64,
-        /// s; 0 leaves `speed` in charge.
-        duration: f64,
-    },
-    /// `movel` and `movep`: the tool to a pose (x, y, z, rotation vector), straight in space.
-    MoveL {
-        /// Tool pose in base.
-        pose: [f64; 6],
-        /// m/s^2.
-        accel: f64,
-        /// m/s.
-        speed: f64,
-        /// s; 0 leaves `speed` in charge.
-        duration: f64,
-    },
-    /// `movec`: the tool along the circle through `via`.
-    MoveC {
-        /// A pose on the way; only its position counts.
-        via: [f64; 6],
-        /// Tool pose at the end, base.
-        pose: [f64; 6],
-        /// m/s^2.
-        accel: f64,
-        /// m/s.
-        speed: f64,
-    },
-    /// `stopj`: joints to rest.
-    StopJ {
-        /// rad/s^2.
-        decel: f64,
-    },
-    /// `stopl`: tool to rest along its direction.
-    StopL {
-        /// m/s^2.
-        decel: f64,
-        /// rad/s^2.
-        rot_decel: f64,
-    },
-}
-
-/// Why the controller itself stops the arm.
-#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
-pub enum StopCause {
-    /// A joint was asked to turn faster than it may.
-    #[error("joint {joint} asked to turn at {speed:.3} rad/s, limit {limit:.3}")]
-    JointSpeed {
-        /// 0 is the base.
-        joint: usize,
-        /// rad/s.
-        speed: f64,
-        /// rad/s.
-        limit: f64,
-    },
-    /// A joint is about to run into its end stop.
-    #[error("joint {joint} at {position:.4} rad is close to its limit")]
-    JointPosition {
-        /// 0 is the base.
-        joint: usize,
-        /// rad.
-        position: f64,
-    },
-    /// A joint does not follow its target.
-    #[error("position of joint {joint} deviates from path by {deviation:.4} rad")]
-    PathDeviation {
-        /// 0 is the base.
-        joint: usize,
-        /// rad.
-        deviation: f64,
-    },
-    /// A tool path leaves the reach of the arm.
-    #[error("no inverse kinematics on the way to the target pose")]
-    Unreachable,
-}
-
-/// What is going on now.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Active {
+pub(super) enum Active {
     Rest,
     Follow(Motion),
     /// To rest at the given rate, then perhaps a move.
@@ -132,30 +24,22 @@ enum Active {
     },
 }
 
-/// Largest acceleration of a target, rad/s^2: what Universal Robots' own control script asks for at most.
-pub(crate) const MAX_TARGET_ACCEL: f64 = 40.0;
-/// Deceleration of a stop by the safety system, rad/s^2.
-pub(crate) const SAFETY_DECEL: f64 = 20.0;
-/// How fast the speed scaling may change, 1/s.
-const SCALING_SLEW: f64 = 5.0;
-/// Largest linear deceleration of `StopL` and friends, m/s^2.
-const MAX_TOOL_ACCEL: f64 = 150.0;
-/// Share of the joint speed limits that reduced mode leaves.
-const REDUCED_SHARE: f64 = 0.5;
+/// Largest rate of change of the speed scaling, 1/s.
+const SCALING_SLEW_PER_S: f64 = 5.0;
 
 /// The motion generator: targets of six joints.
 #[derive(Clone, Debug)]
 pub struct Generator {
-    q: Joints,
-    qd: Joints,
+    pub(super) q: Joints,
+    pub(super) qd: Joints,
     qdd: Joints,
-    active: Active,
-    scaling: f64,
-    max_speed: Joints,
+    pub(super) active: Active,
+    pub(super) scaling: f64,
+    pub(super) max_speed: Joints,
     position_limit: Joints,
-    reduced: bool,
-    kinematics: Kinematics,
-    tool: Isometry3<f64>,
+    pub(super) reduced: bool,
+    pub(super) kinematics: Kinematics,
+    pub(super) tool: Isometry3<f64>,
 }
 
 impl Generator {
@@ -276,7 +160,7 @@ impl Generator {
 
     /// One control step. `wanted_scaling` (0 to 1) slows everything but a stop. Bounded work: at most one inverse kinematics.
     pub fn step(&mut self, dt: f64, wanted_scaling: f64) -> Result<(), StopCause> {
-        let slew = SCALING_SLEW * dt;
+        let slew = SCALING_SLEW_PER_S * dt;
         self.scaling += (wanted_scaling.clamp(0.0, 1.0) - self.scaling).clamp(-slew, slew);
         let (q, qd) = (self.q, self.qd);
         let result = self.advance(dt);
@@ -328,7 +212,7 @@ impl Generator {
     }
 
     fn path_scaling(&self) -> f64 {
-        self.scaling * if self.reduced { REDUCED_SHARE } else { 1.0 }
+        self.scaling * if self.reduced { REDUCED_SPEED_FRACTION } else { 1.0 }
     }
 
     /// Turns a waiting move into a path from where the arm now rests.
@@ -359,87 +243,6 @@ impl Generator {
     /// Tool pose by the targets.
     pub fn tool_pose(&self) -> Isometry3<f64> {
         self.kinematics.forward(&self.q) * self.tool
-    }
-
-    /// Slows the joints, the leading one at `decel`; true at rest.
-    fn brake(&mut self, decel: f64, dt: f64) -> bool {
-        let goal = [0.0; 6];
-        self.approach(&goal, decel, dt);
-        self.qd.iter().all(|v| *v == 0.0)
-    }
-
-    /// Moves the joint speeds straight towards `goal`, the leading axis at `accel`, and integrates.
-    fn approach(&mut self, goal: &Joints, accel: f64, dt: f64) {
-        let most = accel.abs().clamp(1e-3, MAX_TARGET_ACCEL) * dt;
-        let delta: Joints = std::array::from_fn(|i| goal[i] - self.qd[i]);
-        let lead = delta.iter().fold(0.0f64, |m, d| m.max(d.abs()));
-        if lead <= most {
-            self.qd = *goal;
-        } else {
-            let share = most / lead;
-            self.qd = std::array::from_fn(|i| self.qd[i] + delta[i] * share);
-        }
-        for i in 0..6 {
-            self.q[i] += self.qd[i] * dt;
-        }
-    }
-
-    fn follow(&mut self, motion: Motion, dt: f64) -> Result<(), StopCause> {
-        match motion {
-            Motion::SpeedJ { qd, accel } => {
-                let goal = self.reduce(qd.map(|v| v * self.scaling));
-                self.approach(&goal, accel, dt);
-            }
-            Motion::SpeedL { twist, accel, rot_accel } => self.tool_follow(&twist, accel, rot_accel, dt),
-            Motion::StopL { decel, rot_decel } => {
-                self.tool_follow(&[0.0; 6], decel, rot_decel, dt);
-                if self.tool_velocity().iter().all(|v| v.abs() < 1e-4) && self.brake(SAFETY_DECEL, dt) {
-                    self.active = Active::Rest;
-                }
-            }
-            Motion::Servo { q, lookahead, gain } => {
-                let settle = (lookahead.clamp(0.03, 0.2) * (300.0 / gain.clamp(100.0, 2000.0)).sqrt()).max(2.0 * dt);
-                // As fast as the lookahead asks, but never faster than the arm can still brake.
-                let goal = std::array::from_fn(|i| {
-                    let e = q[i] - self.q[i];
-                    let can_brake = (2.0 * 0.8 * MAX_TARGET_ACCEL * e.abs()).sqrt();
-                    let v = (e / settle).clamp(-can_brake, can_brake);
-                    v.clamp(-self.max_speed[i], self.max_speed[i]) * self.scaling
-                });
-                let goal = self.reduce(goal);
-                let most = MAX_TARGET_ACCEL * dt;
-                for ((q, qd), goal) in self.q.iter_mut().zip(&mut self.qd).zip(goal) {
-                    *qd += (goal - *qd).clamp(-most, most);
-                    *q += *qd * dt;
-                }
-            }
-            _ => {}
-        }
-        Ok(())
-    }
-
-    fn tool_follow(&mut self, twist: &[f64; 6], accel: f64, rot_accel: f64, dt: f64) {
-        let now = Vector6::from(self.tool_velocity());
-        let mut next = now;
-        for (rows, rate) in [(0, accel.abs().min(MAX_TOOL_ACCEL)), (3, rot_accel.abs().min(MAX_TOOL_ACCEL))] {
-            let goal = Vector3::new(twist[rows], twist[rows + 1], twist[rows + 2]) * self.scaling;
-            let have = now.fixed_rows::<3>(rows).into_owned();
-            let delta = goal - have;
-            let most = rate.max(1e-3) * dt;
-            let share = if delta.norm() <= most { 1.0 } else { most / delta.norm() };
-            next.fixed_rows_mut::<3>(rows).copy_from(&(have + delta * share));
-        }
-        let goal = self.reduce(self.kinematics.joint_rates(&self.q, &self.tool, &next.into()));
-        self.approach(&goal, MAX_TARGET_ACCEL, dt);
-    }
-
-    /// Scales joint rates into the reduced limits, keeping their direction.
-    fn reduce(&self, qd: Joints) -> Joints {
-        if !self.reduced {
-            return qd;
-        }
-        let over = (0..6).map(|i| qd[i].abs() / (self.max_speed[i] * REDUCED_SHARE)).fold(1.0, f64::max);
-        qd.map(|v| v / over)
     }
 
     /// Speed limits, and position limits with room left to brake.

@@ -9,14 +9,17 @@ mod generator;
 mod gravity;
 mod kinematics;
 mod model;
+mod motion;
 mod path;
 mod profile;
+mod tracking;
 
 pub use drives::{DriveFault, Drives};
-pub use generator::{Generator, Motion, StopCause};
+pub use generator::Generator;
 pub use gravity::gravity_torques;
 pub use kinematics::{DhRow, Kinematics, KinematicsFileError, pose_to_vector, vector_to_pose};
 pub use model::{Generation, Model, UnknownModel};
+pub use motion::{Motion, StopCause};
 pub use path::CartesianPath;
 pub use profile::Profile;
 

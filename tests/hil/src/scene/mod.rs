@@ -7,7 +7,6 @@
 
 mod body;
 mod layers;
-mod program;
 mod raster;
 mod sensor;
 mod solid;
@@ -16,7 +15,6 @@ mod view;
 mod wheel;
 
 pub use body::Body;
-pub use program::{Args, Fault, main_with_args};
 pub use sensor::{Noise, Sensor};
 pub use solid::{Face, Solid};
 pub use stage::{Stage, Thing};

@@ -5,8 +5,9 @@ use super::error::HostError;
 use super::host::{Bank, Host, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup, Target, WatchdogAction};
 use super::pure::{boolean, finite, index, int32, number, pose, six, text};
 use super::signature::bind;
-use super::sockets::{SocketBuffers, SocketWait};
+use super::sockets::SocketBuffers;
 use super::value::Value;
+use super::wait::{Flow, Wait};
 use super::{pure, sockets};
 
 /// Integer and float registers of either bank.
@@ -42,24 +43,6 @@ const SETTINGS: [&str; 25] = [
     "set_conveyor_tick_count",
     "reset_revolution_counter",
 ];
-
-/// What a thread waits for.
-#[derive(Clone, Debug)]
-pub(crate) enum Wait {
-    /// Control steps left.
-    Steps(u32),
-    Motion,
-    Popup,
-    Thread(u32),
-    Socket(SocketWait),
-}
-
-/// Whether a call has a value now.
-#[derive(Clone, Debug)]
-pub(crate) enum Flow {
-    Value(Value),
-    Wait(Wait),
-}
 
 fn refused(e: HostError) -> String {
     e.to_string()

@@ -28,6 +28,7 @@ mod builtins;
 mod collector;
 mod compile;
 mod error;
+mod execute;
 mod expression;
 mod host;
 mod lexer;
@@ -36,7 +37,9 @@ mod parser;
 mod pure;
 mod signature;
 mod sockets;
+mod thread;
 mod value;
+mod wait;
 
 pub use collector::{Collector, Upload};
 pub use error::{HostError, RuntimeError, ScriptError};

@@ -1,10 +1,10 @@
 //! Sockets of a script: buffers between the host's bytes and the script's numbers, lines and texts.
 
 use super::arithmetic::Outcome;
-use super::builtins::{Flow, Wait};
 use super::host::{Connect, Host, Received};
 use super::pure::{MAX_TEXT, boolean, index, int32, number, text};
 use super::value::Value;
+use super::wait::{Flow, Read, SocketWait, Wait};
 use std::collections::BTreeMap;
 
 /// Sockets open at once.
@@ -21,29 +21,6 @@ const CONNECT_SECONDS: f64 = 2.0;
 /// Received and not yet read bytes by connection.
 #[derive(Default)]
 pub(crate) struct SocketBuffers(BTreeMap<String, Vec<u8>>);
-
-/// A blocking socket call under way.
-#[derive(Clone, Debug)]
-pub(crate) enum SocketWait {
-    Connect { name: String, address: String, port: u16, steps: u32 },
-    Read { name: String, what: Read, steps: Option<u32> },
-}
-
-/// What a read gives.
-#[derive(Clone, Debug)]
-pub(crate) enum Read {
-    Integers(usize),
-    Bytes(usize),
-    Floats(usize),
-    Line,
-    /// Everything that is there, or the text between two marks.
-    Any {
-        prefix: String,
-        suffix: String,
-    },
-    /// The number in a line `name number`.
-    Variable(String),
-}
 
 /// Control steps in `seconds`, at least one; `None` (for ever) for zero and less, as UR's timeout of 0.
 fn steps(seconds: f64, host: &dyn Host) -> Option<u32> {

@@ -1,0 +1,44 @@
+//! What a blocked thread waits for, and whether a call has a value yet.
+
+use super::value::Value;
+
+/// What a thread waits for.
+#[derive(Clone, Debug)]
+pub(crate) enum Wait {
+    /// Control steps left.
+    Steps(u32),
+    Motion,
+    Popup,
+    Thread(u32),
+    Socket(SocketWait),
+}
+
+/// Whether a call has a value now.
+#[derive(Clone, Debug)]
+pub(crate) enum Flow {
+    Value(Value),
+    Wait(Wait),
+}
+
+/// A blocking socket call under way.
+#[derive(Clone, Debug)]
+pub(crate) enum SocketWait {
+    Connect { name: String, address: String, port: u16, steps: u32 },
+    Read { name: String, what: Read, steps: Option<u32> },
+}
+
+/// What a read gives.
+#[derive(Clone, Debug)]
+pub(crate) enum Read {
+    Integers(usize),
+    Bytes(usize),
+    Floats(usize),
+    Line,
+    /// Everything that is there, or the text between two marks.
+    Any {
+        prefix: String,
+        suffix: String,
+    },
+    /// The number in a line `name number`.
+    Variable(String),
+}
