@@ -1,4 +1,4 @@
-//! The robot as a script sees it.
+//! The robot as the host of the script interpreter.
 
 use super::message::MessageKind;
 use super::registers::Registers;
@@ -41,7 +41,7 @@ impl Robot {
     }
 }
 
-/// Seconds of a call's `t`: `None` when it is not given.
+/// Duration `t` of a call, s; zero means that it was not given.
 fn given(t: f64) -> Option<f64> {
     (t > 0.0).then_some(t)
 }
@@ -145,7 +145,7 @@ impl Host for Robot {
             return MotionStatus::Failed(text);
         }
         let done = match self.motion_left_s {
-            // Half a step of slack, so that a time of n steps takes n steps whatever its last bit says.
+            // Half a step of tolerance: a time of n steps must take n steps despite rounding.
             Some(left) => left <= self.dt * 0.5,
             None => self.generator.is_settled(),
         };
@@ -202,7 +202,7 @@ impl Host for Robot {
     }
 
     fn set_payload(&mut self, mass: f64, cog: Option<[f64; 3]>) -> Result<(), HostError> {
-        // The controller takes a little more than the data sheet's figure.
+        // The controller accepts slightly more than the data sheet's payload.
         if !(0.0..=self.setup.model.max_payload * 1.1).contains(&mass) {
             return Err(HostError::Refused(format!(
                 "set_payload: {mass} kg is outside 0 to {} kg",

@@ -6,11 +6,11 @@ use super::state::RobotMode;
 use crate::plant::{Joints, gravity_torques, pose_to_vector};
 use nalgebra::Vector6;
 
-/// Torque constant and gear together, Nm/A: gives currents of the size that UR arms show.
+/// Torque per motor current at the joint, Nm/A, chosen so that currents have the magnitude of real arms.
 const NM_PER_AMPERE: Joints = [13.0, 13.0, 12.0, 8.0, 8.0, 8.0];
 
-/// `speed_scaling`: what the trajectory limiter leaves of the speed that the slider asks for. Clients multiply it by
-/// `target_speed_fraction`, which is the slider itself.
+/// `speed_scaling`: the fraction of the slider's speed that the trajectory limiter permits. Clients multiply it by
+/// `target_speed_fraction`, which is the slider.
 fn limiter(scaling: f64, slider: f64) -> f64 {
     if slider > 1e-9 { (scaling / slider).min(1.0) } else { 1.0 }
 }
@@ -26,7 +26,7 @@ impl Robot {
         let holding = self.mode == RobotMode::Running;
         let gravity =
             if holding { gravity_torques(k, &self.setup.model.masses, self.payload.mass, &q) } else { [0.0; 6] };
-        // A link as heavy as a rod adds a little torque for its own acceleration.
+        // A rough inertia term, proportional to the link's mass.
         let torque = |acc: &Joints| -> Joints {
             std::array::from_fn(|i| gravity[i] + 0.05 * self.setup.model.masses[i] * acc[i])
         };

@@ -3,31 +3,31 @@
 use crate::plant::Joints;
 use std::collections::VecDeque;
 
-/// Control steps kept for `get_actual_joint_positions_history`: two seconds at 500 Hz.
-const HISTORY: usize = 1000;
-/// A force at the tool that counts as contact, N.
-const CONTACT_N: f64 = 5.0;
+/// Control steps kept for `get_actual_joint_positions_history`: 2 s at 500 Hz.
+const HISTORY_STEPS: usize = 1000;
+/// Smallest force at the tool that counts as contact, N.
+const MIN_CONTACT_N: f64 = 5.0;
 
-/// What scripts may ask about the past, and small states that only scripts know.
+/// The joint history, the contact counter, flags and the random generator of scripts.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Memory {
     /// Measured joint positions, newest last.
     pub(super) history: VecDeque<Joints>,
-    /// Control steps since the tool touched something; 0 while it touches nothing.
+    /// Control steps since contact began; 0 without contact.
     pub(super) contact_steps: u32,
-    /// `set_flag`.
+    /// Flags of `set_flag`, one bit each.
     pub(super) flags: u32,
     random: u64,
 }
 
 impl Memory {
-    /// One control step passed.
+    /// Records one control step.
     pub(super) fn note(&mut self, q: &Joints, force: &[f64; 6]) {
-        if self.history.len() == HISTORY {
+        if self.history.len() == HISTORY_STEPS {
             self.history.pop_front();
         }
         self.history.push_back(*q);
-        let touching = force.iter().take(3).map(|f| f * f).sum::<f64>().sqrt() > CONTACT_N;
+        let touching = force.iter().take(3).map(|f| f * f).sum::<f64>().sqrt() > MIN_CONTACT_N;
         self.contact_steps = if touching { self.contact_steps.saturating_add(1) } else { 0 };
     }
 

@@ -1,10 +1,10 @@
-//! A Universal Robots controller as its clients see it.
+//! A simulated Universal Robots controller.
 //!
-//! Layers, in the order a reader should learn them: [`Robot`] is the whole robot in memory, one control step a call; [`World`] adds
-//! the oracle ([`Judge`]), the wire record and the faults; [`Server`] puts it behind sockets. [`main_with_args`] is the program.
+//! Layers, in reading order: [`Robot`] is the robot in memory, one control step per call; [`World`] adds the test oracle
+//! ([`Judge`]), the wire record and the faults; [`Server`] puts it behind sockets. [`main_with_args`] is the program.
 //!
-//! The controller's half of the wire formats is written apart from the daemon's client, so that a mistake in one of them
-//! shows; only the table of variables is shared.
+//! The controller's side of the wire formats shares no code with the daemon's client, so that an error in one of them
+//! shows as a disagreement. Only the table of RTDE variables is shared.
 
 mod cli;
 mod command;

@@ -1,4 +1,4 @@
-//! Programs on the controller: upload, play, pause, stop, and their turn in each control step.
+//! Programs on the controller: upload, play, pause, stop, watchdogs, and their execution in each control step.
 
 use super::message::MessageKind;
 use super::programs::{MAX_SECONDARY, Upload};
@@ -8,13 +8,13 @@ use crate::plant::Motion;
 use crate::urscript::{Machine, ProgramKind, StepOutcome, WatchdogAction};
 
 impl Robot {
-    /// Whether the main program is playing: bit 1 of `robot_status_bits`.
+    /// Whether the main program is running: bit 1 of `robot_status_bits`.
     pub fn is_program_running(&self) -> bool {
         matches!(self.runtime, RuntimeState::Playing | RuntimeState::Resuming)
     }
 
-    /// Takes a script as ports 30001 to 30003 do: `def` replaces the main program, `sec` runs beside it, a bare line is a
-    /// program of one line.
+    /// Takes a script as ports 30001 to 30003 do: `def` replaces the main program, `sec` runs as a secondary program, a bare
+    /// line is a program of one line.
     pub fn upload(&mut self, text: &str) -> Upload {
         let machine = match Machine::load(text) {
             Ok(machine) => machine,
@@ -44,7 +44,7 @@ impl Robot {
         Upload::Main
     }
 
-    /// Loads `NAME.urp`, that is `NAME.script` of the program directory; false when there is none.
+    /// Loads `NAME.urp`, i.e. `NAME.script` of the program directory; false if there is none.
     pub fn load_program(&mut self, name: &str) -> bool {
         let stem = name.trim().trim_end_matches(".urp");
         if stem.is_empty() || stem.contains(['/', '\\']) || stem.starts_with('.') {
@@ -65,7 +65,7 @@ impl Robot {
         self.programs.loaded.as_ref().map(|(name, _)| name.as_str())
     }
 
-    /// Starts the loaded program, or lets a paused one go on; false when neither can be.
+    /// Starts the loaded program or resumes a paused one; false if neither is possible.
     pub fn play(&mut self) -> bool {
         if self.mode != RobotMode::Running || !self.safety.allows_motion() {
             return false;
@@ -79,7 +79,7 @@ impl Robot {
         self.upload(&text) == Upload::Main
     }
 
-    /// Pauses the program; the arm comes to rest on its path. False when none plays.
+    /// Pauses the program; the arm comes to rest on its path. False if no program is running.
     pub fn pause_program(&mut self) -> bool {
         let playing = self.is_program_running();
         if playing {
@@ -95,7 +95,7 @@ impl Robot {
         }
     }
 
-    /// Ends the main program: its motion, its watchdogs, its sockets.
+    /// Ends the main program, its motion, its watchdogs and its sockets.
     pub(super) fn end_program(&mut self) {
         self.watchdogs.clear();
         self.sockets.close_all();
@@ -107,13 +107,13 @@ impl Robot {
         }
     }
 
-    /// One step of every program.
+    /// Runs one control step of every program.
     pub(super) fn run_programs(&mut self) {
         if self.is_program_running()
             && let Some(mut main) = self.programs.main.take()
         {
             let outcome = main.step(self);
-            // The step may itself have ended the program (a protective stop): then it does not come back.
+            // The step itself may have ended the program, for example by a protective stop.
             if self.programs.active {
                 self.programs.main = Some(main);
                 self.conclude(outcome);
@@ -142,7 +142,7 @@ impl Robot {
         }
     }
 
-    /// `Stopping` and `Pausing` end when the arm rests.
+    /// Ends `Stopping` and `Pausing` once the arm is at rest.
     pub(super) fn settle_runtime(&mut self) {
         let rest = self.generator.at_rest();
         match self.runtime {
@@ -152,7 +152,7 @@ impl Robot {
         }
     }
 
-    /// Pauses or stops the program when an input went silent.
+    /// Pauses or stops the program if a watched input was not written in time.
     pub(super) fn check_watchdogs(&mut self) {
         if self.deaf_watchdog || !self.is_program_running() {
             return;

@@ -5,25 +5,25 @@ use crate::urscript::Machine;
 /// Secondary programs (`sec`) that may run at a time; further ones are refused.
 pub(super) const MAX_SECONDARY: usize = 8;
 
-/// The main program and those beside it.
+/// The main program and the secondary programs.
 #[derive(Default)]
 pub(super) struct Programs {
     pub(super) main: Option<Machine>,
-    /// Whether the main program is under way; false as soon as it is ended, even from inside its own step.
+    /// Whether the main program is active; false as soon as it is ended, even from within its own step.
     pub(super) active: bool,
     pub(super) secondary: Vec<Machine>,
-    /// Name and text of the program that `play` starts.
+    /// Name and text of the program started by `play`.
     pub(super) loaded: Option<(String, String)>,
 }
 
-/// What became of a text sent to ports 30001 to 30003.
+/// Outcome of a text sent to ports 30001 to 30003.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Upload {
-    /// It replaces the main program.
+    /// It replaced the main program.
     Main,
-    /// It runs beside the main program.
+    /// It runs as a secondary program.
     Secondary,
-    /// Refused, with the reason that the robot shows.
+    /// Refused, with the reason.
     Refused(String),
 }
 

@@ -1,4 +1,4 @@
-//! Functions of the script language that only ask the controller: history, contact, limits, temperatures.
+//! Script functions that query the controller: history, contact, limits, temperatures, flags.
 
 use super::robot::Robot;
 use crate::urscript::{Host, HostError, KinematicsQuery, Value};
@@ -17,29 +17,31 @@ fn whole(v: Option<&Value>, limit: usize) -> Option<usize> {
 }
 
 impl Robot {
-    /// Answers a function of the script that moves nothing.
+    /// Evaluates a query function of a script.
     ///
     /// # Errors
-    /// Unknown names, and arguments that the function does not take.
+    /// The name is unknown or an argument is invalid.
     pub(super) fn answer(&mut self, name: &str, a: &[Value]) -> Result<Value, HostError> {
         let bad = |what: &str| refused(format!("{name}: {what}"));
         Ok(match name {
             "get_actual_joint_positions_history" => {
-                let back = whole(a.first(), usize::MAX).ok_or_else(|| bad("a number of steps from 0 on is needed"))?;
-                // The manual: steps beyond what is kept give the oldest that is.
+                let back = whole(a.first(), usize::MAX).ok_or_else(|| bad("expected a number of steps, at least 0"))?;
+                // Script manual: beyond the history the oldest sample is returned.
                 let at = self.memory.history.len().saturating_sub(1).saturating_sub(back);
                 Value::floats(&self.memory.history.get(at).copied().unwrap_or(self.truth.actual_q))
             }
             "get_target_joint_accelerations" => Value::floats(&self.truth.target_qdd),
             "get_target_payload_inertia" => Value::floats(&self.payload.inertia),
-            "is_within_safety_limits" => Value::Bool(self.within_limits(a).ok_or_else(|| bad("a pose or six joints"))?),
+            "is_within_safety_limits" => {
+                Value::Bool(self.within_limits(a).ok_or_else(|| bad("expected a pose or six joint positions"))?)
+            }
             "tool_contact" => {
                 let force = self.truth.tcp_force;
                 let along = match a.first() {
                     None | Some(Value::None) => None,
-                    some => Some(six(some).ok_or_else(|| bad("the direction is a pose or six numbers"))?),
+                    some => Some(six(some).ok_or_else(|| bad("the direction must be a pose or six numbers"))?),
                 };
-                // A direction asks for contact that opposes a motion that way; none, or zero, asks for any.
+                // With a direction only contact opposing a motion in that direction counts; without one (or zero) any.
                 let opposes = along.is_none_or(|d| {
                     let dot: f64 = d.iter().zip(&force).take(3).map(|(d, f)| d * f).sum();
                     d.iter().take(3).all(|v| *v == 0.0) || dot < 0.0
@@ -47,7 +49,7 @@ impl Robot {
                 let steps = if opposes { self.memory.contact_steps } else { 0 };
                 Value::Int(i32::try_from(steps).unwrap_or(i32::MAX))
             }
-            // 0 normal, 1 near a singularity, 2 too near.
+            // 0 normal, 1 close to a singularity, 2 too close.
             "get_freedrive_status" => Value::Int(0),
             "get_joint_temp" => {
                 let joint = whole(a.first(), 6).ok_or_else(|| bad("joints are numbered 0 to 5"))?;
@@ -62,7 +64,7 @@ impl Robot {
             }
             "set_flag" => {
                 let n = whole(a.first(), 32).ok_or_else(|| bad("flags are numbered 0 to 31"))?;
-                let Some(Value::Bool(on)) = a.get(1) else { return Err(bad("a boolean is needed")) };
+                let Some(Value::Bool(on)) = a.get(1) else { return Err(bad("expected a boolean")) };
                 self.memory.flags = self.memory.flags & !(1 << n) | u32::from(*on) << n;
                 Value::None
             }
@@ -71,7 +73,7 @@ impl Robot {
         })
     }
 
-    /// Whether joints, or a pose by its nearest solution, lie inside the joint limits.
+    /// Whether joint positions, or the nearest solution for a pose, are within the joint limits.
     fn within_limits(&self, a: &[Value]) -> Option<bool> {
         let limit = self.setup.model.position_limit();
         let q = match a.first()? {

@@ -1,10 +1,10 @@
-//! What the controller tells about one step: computed once, read by every interface.
+//! The values of one control step: computed once, read by every interface.
 
 use crate::plant::Joints;
 
 /// Values of one control step, SI units; poses are x, y, z and rotation vector in base.
 #[derive(Clone, Debug, Default, PartialEq)]
-#[expect(missing_docs, reason = "the fields carry the RTDE outputs' own names")]
+#[expect(missing_docs, reason = "the fields have the names of the RTDE outputs")]
 pub struct Report {
     pub target_q: Joints,
     pub target_qd: Joints,
@@ -28,40 +28,41 @@ pub struct Report {
     pub robot_current: f64,
 }
 
-/// How the report is distorted on command (faults B08, B10, B17).
+/// Faults in the reported values; the robot itself is unaffected.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ReportFault {
-    /// This joint's position reads as not a number.
+    /// Joint whose position reads as NaN.
     pub nan_position: Option<usize>,
-    /// This joint's speed reads as not a number.
+    /// Joint whose speed reads as NaN.
     pub nan_speed: Option<usize>,
-    /// Added to the joint positions read, rad.
+    /// Added to the joint positions, rad.
     pub offset: Joints,
-    /// These two joints are told in each other's place.
+    /// Two joints that are exchanged.
     pub swapped: Option<(usize, usize)>,
 }
 
 impl Report {
-    /// The same with a fault on it.
+    /// The report with a fault applied.
     pub(super) fn distorted(&self, fault: &ReportFault) -> Report {
-        let mut told = self.clone();
+        let mut reported = self.clone();
         for i in 0..6 {
-            told.actual_q[i] += fault.offset[i];
+            reported.actual_q[i] += fault.offset[i];
         }
         if let Some((a, b)) = fault.swapped
             && a < 6
             && b < 6
         {
-            for v in [&mut told.actual_q, &mut told.actual_qd, &mut told.target_q, &mut told.target_qd] {
+            for v in [&mut reported.actual_q, &mut reported.actual_qd, &mut reported.target_q, &mut reported.target_qd]
+            {
                 v.swap(a, b);
             }
         }
-        if let Some(v) = fault.nan_position.and_then(|i| told.actual_q.get_mut(i)) {
+        if let Some(v) = fault.nan_position.and_then(|i| reported.actual_q.get_mut(i)) {
             *v = f64::NAN;
         }
-        if let Some(v) = fault.nan_speed.and_then(|i| told.actual_qd.get_mut(i)) {
+        if let Some(v) = fault.nan_speed.and_then(|i| reported.actual_qd.get_mut(i)) {
             *v = f64::NAN;
         }
-        told
+        reported
     }
 }

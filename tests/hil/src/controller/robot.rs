@@ -1,4 +1,4 @@
-//! The whole robot in memory: arm, safety, program, registers. No socket, no clock: [`Robot::step`] is one control step.
+//! The robot in memory: arm, safety, programs, registers. No servers and no clock: [`Robot::step`] is one control step.
 
 use super::memory::Memory;
 use super::message::{MessageKind, Outbox};
@@ -12,41 +12,41 @@ use crate::plant::{Drives, Generator, Joints, Kinematics, Model, StopCause};
 use crate::urscript::Popup;
 use nalgebra::Isometry3;
 
-/// Acceleration that the drives can give, rad/s^2.
-const DRIVE_ACCEL: f64 = 80.0;
-/// Deviation of a joint from its target that stops the arm, rad: Universal Robots' position tolerance of 5 degrees.
-const PATH_TOLERANCE: f64 = 0.087;
-/// Deceleration when a program ends or is stopped, rad/s^2: the same as the stop in Universal Robots' control script.
+/// Largest acceleration of the drives, rad/s^2.
+const MAX_DRIVE_ACCEL: f64 = 80.0;
+/// Largest deviation of a joint from its target before a protective stop, rad: UR's position tolerance of 5 degrees.
+const MAX_PATH_DEVIATION_RAD: f64 = 0.087;
+/// Deceleration when a program ends or is stopped, rad/s^2: that of the stop in UR's own control script.
 pub const PROGRAM_STOP_DECEL: f64 = 4.0;
 
 /// Message for a joint number that is out of range.
 pub(super) const JOINT_NUMBERS: &str = "joints are numbered 0 to 5";
 
-/// What a robot is when it starts.
+/// Initial configuration of a robot.
 #[derive(Clone, Debug)]
 pub struct Setup {
-    /// Which arm.
+    /// Arm model.
     pub model: Model,
-    /// Its true kinematics; the model's nominal ones unless a unit's calibration is given.
+    /// True kinematics: the model's nominal ones, or the calibration of one unit.
     pub kinematics: Kinematics,
-    /// Where it stands, rad.
+    /// Initial joint positions, rad.
     pub start_joints: Joints,
-    /// Control steps a second.
+    /// Control rate, Hz.
     pub rate_hz: f64,
-    /// Robot mode at the start: running, or switched off.
+    /// Robot mode at the start: running or powered off.
     pub start_mode: RobotMode,
-    /// Controller time at the start, s. Above 40 s Universal Robots' C++ client does not wait for a boot to end.
+    /// Controller time at the start, s. Below 40 s UR's C++ client waits for the controller to finish booting.
     pub start_clock_s: f64,
-    /// How long powering on and releasing the brakes take, each, s.
+    /// Duration of powering on and of releasing the brakes, each, s.
     pub power_time_s: f64,
-    /// Serial number for the dashboard.
+    /// Serial number, as answered by the dashboard.
     pub serial: String,
-    /// Where `load NAME.urp` finds `NAME.script`.
+    /// Directory in which `load NAME.urp` looks for `NAME.script`.
     pub programs: Option<std::path::PathBuf>,
 }
 
 impl Setup {
-    /// The model as delivered, powered and standing in a bent-elbow pose.
+    /// The nominal model, powered, at rest in a bent-elbow pose.
     pub fn new(model: Model) -> Self {
         Setup {
             model,
@@ -62,7 +62,7 @@ impl Setup {
     }
 }
 
-/// Mass and tool at the flange.
+/// Payload at the flange.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Payload {
     /// kg.
@@ -75,7 +75,7 @@ pub struct Payload {
 
 /// The robot and its controller.
 pub struct Robot {
-    /// What it started as.
+    /// Initial configuration.
     pub setup: Setup,
     /// Control step, s.
     pub dt: f64,
@@ -89,9 +89,9 @@ pub struct Robot {
     pub safety: SafetyMode,
     /// Program state.
     pub runtime: RuntimeState,
-    /// Written by RTDE clients.
+    /// Input registers, written by RTDE clients.
     pub inputs: Registers,
-    /// Written by scripts.
+    /// Output registers, written by scripts.
     pub outputs: Registers,
     /// Digital and analog signals.
     pub signals: Signals,
@@ -99,7 +99,7 @@ pub struct Robot {
     pub external_wrench: [f64; 6],
     /// Speed slider, 0 to 1.
     pub slider: f64,
-    /// At the flange.
+    /// Payload at the flange.
     pub payload: Payload,
     /// Tool centre point in the flange frame.
     pub tcp: [f64; 6],
@@ -109,17 +109,17 @@ pub struct Robot {
     pub outbox: Outbox,
     /// Open popup.
     pub popup: Option<Popup>,
-    /// What is true of this step.
+    /// Values of the present step.
     pub truth: Report,
-    /// What RTDE, primary and real-time interfaces tell of it.
+    /// The same values as reported by the RTDE, primary and real-time interfaces, faults included.
     pub report: Report,
-    /// Distortions of the report.
+    /// Faults in the reported values.
     pub report_fault: ReportFault,
-    /// Whether `rtde_set_watchdog` is accepted but never acts (fault R15).
+    /// Fault: `rtde_set_watchdog` is accepted without effect.
     pub deaf_watchdog: bool,
-    /// Whether writes of scripts to output registers are lost (fault R15).
+    /// Fault: what scripts write to output registers is lost.
     pub mute_outputs: bool,
-    /// Robot type answered on the primary interface in place of the true one (fault B17).
+    /// Fault: robot type reported on the primary interface instead of the true one.
     pub claimed_robot_type: Option<i32>,
     pub(super) generator: Generator,
     pub(super) drives: Drives,
@@ -135,7 +135,7 @@ pub struct Robot {
 }
 
 impl Robot {
-    /// A robot as `setup` says.
+    /// A robot with this configuration.
     pub fn new(setup: Setup) -> Self {
         let dt = 1.0 / setup.rate_hz;
         let q = setup.start_joints;
@@ -163,7 +163,7 @@ impl Robot {
             mute_outputs: false,
             claimed_robot_type: None,
             generator: Generator::new(q, setup.kinematics, setup.model.max_speed, setup.model.position_limit()),
-            drives: Drives::new(q, DRIVE_ACCEL).limited(setup.model.max_speed),
+            drives: Drives::new(q, MAX_DRIVE_ACCEL).limited(setup.model.max_speed),
             programs: Programs::default(),
             watchdogs: Watchdogs::default(),
             motion_left_s: None,
@@ -181,7 +181,7 @@ impl Robot {
         robot
     }
 
-    /// One control step: program, motion, joints, supervision. Returns with `report` renewed.
+    /// Runs one control step: programs, motion, joints, supervision, then the report.
     pub fn step(&mut self) {
         self.steps += 1;
         self.clock_s = self.setup.start_clock_s + self.clock_offset_s + self.steps as f64 * self.dt;
@@ -205,7 +205,7 @@ impl Robot {
         (self.clock_s.max(0.0) * 1e6) as u64
     }
 
-    /// Lets the controller's clock start again from zero, or jump by `by_s` seconds (fault R12).
+    /// Restarts controller time at zero, or shifts it by `by_s` seconds.
     pub fn shift_clock(&mut self, by_s: Option<f64>) {
         self.clock_offset_s = match by_s {
             Some(by) => self.clock_offset_s + by,
@@ -239,7 +239,7 @@ impl Robot {
             let worst = (0..6)
                 .map(|i| (i, (q[i] - self.generator.q()[i]).abs()))
                 .fold((0, 0.0), |m, d| if d.1 > m.1 { d } else { m });
-            if worst.1 > PATH_TOLERANCE {
+            if worst.1 > MAX_PATH_DEVIATION_RAD {
                 self.stop_for(StopCause::PathDeviation { joint: worst.0, deviation: worst.1 });
             }
         }
@@ -247,7 +247,7 @@ impl Robot {
 
     fn stop_for(&mut self, cause: StopCause) {
         if cause == StopCause::Unreachable {
-            // The script's own mistake: its call fails, and the program with it.
+            // An error of the script: its call fails, and the program ends.
             self.motion_failure = Some(cause.to_string());
             return;
         }
@@ -261,23 +261,23 @@ impl Robot {
         self.stop_protectively(code, argument);
     }
 
-    /// Puts the arm at `q`, at rest (faults B07 and B11, and the start of a test).
+    /// Places the arm at `q`, at rest.
     pub fn teleport(&mut self, q: Joints) {
         let fault = *self.drives.fault();
-        self.drives = Drives::new(q, DRIVE_ACCEL).limited(self.setup.model.max_speed);
+        self.drives = Drives::new(q, MAX_DRIVE_ACCEL).limited(self.setup.model.max_speed);
         self.drives.set_fault(fault);
         self.drives.set_brakes(self.mode != RobotMode::Running);
         self.generator.snap(q);
     }
 
-    /// Puts a disturbance on the joints.
+    /// Changes the disturbance of the joints.
     pub fn set_drive_fault(&mut self, change: impl FnOnce(&mut crate::plant::DriveFault)) {
         let mut fault = *self.drives.fault();
         change(&mut fault);
         self.drives.set_fault(fault);
     }
 
-    /// Puts a disturbance on one joint.
+    /// Changes the disturbance of one joint.
     ///
     /// # Errors
     /// There is no such joint.
@@ -305,7 +305,7 @@ impl Robot {
         Ok(())
     }
 
-    /// Whether targets and joints stand still.
+    /// Whether targets and joints are at rest.
     pub fn at_rest(&self) -> bool {
         self.generator.at_rest() && self.drives.read_qd().iter().all(|v| v.abs() < 1e-3)
     }

@@ -5,7 +5,7 @@ use super::robot::Robot;
 use super::state::{RobotMode, RuntimeState, SafetyMode};
 
 impl Robot {
-    /// Stops the arm as the safety system does; unlocking is refused for five seconds. The program is stopped.
+    /// Protective stop: stops the arm and the program. Unlocking is refused for 5 s.
     pub fn stop_protectively(&mut self, code: i32, argument: i32) {
         if self.safety.allows_motion() {
             self.enter_safety(SafetyMode::ProtectiveStop, code, argument);
@@ -26,7 +26,7 @@ impl Robot {
         self.set_mode(RobotMode::Running);
     }
 
-    /// Stops the arm with power kept and the program paused, until [`Robot::clear_safety`].
+    /// Safeguard stop: the arm stays powered and the program is paused, until [`Robot::clear_safety`].
     pub fn safeguard_stop(&mut self) {
         if self.safety.allows_motion() {
             self.enter_safety(SafetyMode::SafeguardStop, 0, 0);
@@ -36,24 +36,25 @@ impl Robot {
         }
     }
 
-    /// Stops the arm, then takes the power away. `system` tells the emergency input from the pendant's button.
+    /// Emergency stop: stops the arm, then removes power. `system` is true for the emergency input, false for the
+    /// pendant's button.
     pub fn emergency_stop(&mut self, system: bool) {
         let mode = if system { SafetyMode::SystemEmergencyStop } else { SafetyMode::RobotEmergencyStop };
         self.enter_safety(mode, 0, 0);
         self.end_program();
         self.generator.safety_stop();
-        // Category 1: half a second of controlled stop, then no power.
+        // Stop category 1: half a second of controlled stop, then power off.
         self.transition = Some((self.clock_s + 0.5, RobotMode::PowerOff));
     }
 
-    /// Brakes at once and takes the power away (category 0): a safety violation, or a fault of the safety system.
+    /// Stop category 0, power off immediately: a safety violation, or a fault of the safety system.
     pub fn safety_failure(&mut self, fault: bool) {
         self.enter_safety(if fault { SafetyMode::Fault } else { SafetyMode::Violation }, 0, 0);
         self.end_program();
         self.set_mode(RobotMode::PowerOff);
     }
 
-    /// Sets or lifts reduced mode; no effect while stopped.
+    /// Enters or leaves reduced mode; no effect on the safety mode while stopped.
     pub fn set_reduced(&mut self, on: bool) {
         if self.safety.allows_motion() {
             self.enter_safety(if on { SafetyMode::Reduced } else { SafetyMode::Normal }, 0, 0);
@@ -61,14 +62,17 @@ impl Robot {
         self.generator.set_reduced(on);
     }
 
-    /// The emergency button is released, the safeguard closed. A protective stop or a fault is not cleared by this.
+    /// Releases the emergency button and closes the safeguard. Does not clear a protective stop or a fault.
     pub fn clear_safety(&mut self) {
         if self.safety.is_emergency() || matches!(self.safety, SafetyMode::SafeguardStop | SafetyMode::Recovery) {
             self.enter_safety(SafetyMode::Normal, 0, 0);
         }
     }
 
-    /// Unlocks a protective stop; refused in the first five seconds and when there is none.
+    /// Unlocks a protective stop.
+    ///
+    /// # Errors
+    /// The stop is less than 5 s old.
     pub fn unlock(&mut self) -> Result<(), &'static str> {
         if self.safety != SafetyMode::ProtectiveStop {
             return Ok(());
@@ -82,7 +86,7 @@ impl Robot {
         Ok(())
     }
 
-    /// Restarts the safety system after a fault or a violation; leaves the arm without power.
+    /// Restarts the safety system after a fault or a violation; the arm stays powered off.
     pub fn restart_safety(&mut self) {
         self.end_program();
         self.set_mode(RobotMode::PowerOff);
@@ -99,7 +103,7 @@ impl Robot {
         }
     }
 
-    /// Starts to power on; the arm ends with brakes on.
+    /// Begins to power on; ends with brakes on. Returns whether the arm is powered.
     pub fn power_on(&mut self) -> bool {
         if self.mode == RobotMode::PowerOff && !self.safety.is_emergency() && !self.safety_failed() {
             self.set_mode(RobotMode::PowerOn);
@@ -108,13 +112,13 @@ impl Robot {
         self.mode.is_powered()
     }
 
-    /// Takes the power away.
+    /// Powers off.
     pub fn power_off(&mut self) {
         self.end_program();
         self.set_mode(RobotMode::PowerOff);
     }
 
-    /// Releases the brakes, powering on first where needed.
+    /// Releases the brakes, after powering on if necessary. False if the safety mode does not allow it.
     pub fn brake_release(&mut self) -> bool {
         if self.safety.is_emergency() || self.safety_failed() {
             return false;
@@ -128,7 +132,7 @@ impl Robot {
         true
     }
 
-    /// Sets the robot mode at once, as a fault does. Anything but running ends the program and sets the brakes.
+    /// Sets the robot mode immediately. Any mode except running ends the program and applies the brakes.
     pub fn set_mode(&mut self, mode: RobotMode) {
         self.transition = None;
         self.mode = mode;

@@ -1,4 +1,4 @@
-//! `rtde_set_watchdog`: an input that must be written often enough, or the program pauses or stops.
+//! `rtde_set_watchdog`: pauses or stops the program if an RTDE input is not written often enough.
 
 use crate::urscript::{HostError, WatchdogAction};
 use graspd_rt::rtde::Field;
@@ -15,8 +15,8 @@ struct Watchdog {
     fed_s: f64,
 }
 
-/// More than a script would ever set.
-const MOST: usize = 64;
+/// Watchdogs of one program.
+const MAX_WATCHDOGS: usize = 64;
 
 impl Watchdogs {
     /// Adds or replaces the watchdog of one input.
@@ -34,14 +34,14 @@ impl Watchdogs {
             return Err(HostError::Refused(format!("rtde_set_watchdog: {frequency} Hz is not a frequency")));
         }
         self.0.retain(|w| w.input != field);
-        // A frequency of zero takes the watchdog away.
-        if frequency > 0.0 && self.0.len() < MOST {
+        // A frequency of zero removes the watchdog.
+        if frequency > 0.0 && self.0.len() < MAX_WATCHDOGS {
             self.0.push(Watchdog { input: field, period_s: 1.0 / frequency, action, fed_s: now_s });
         }
         Ok(())
     }
 
-    /// Some client wrote `input`.
+    /// Notes that a client wrote `input`.
     pub(super) fn feed_field(&mut self, input: Field, now_s: f64) {
         for w in &mut self.0 {
             if w.input == input {
@@ -50,19 +50,19 @@ impl Watchdogs {
         }
     }
 
-    /// A paused program goes on: every watchdog starts afresh.
+    /// Restarts all watchdogs when a paused program resumes.
     pub(super) fn feed_all(&mut self, now_s: f64) {
         for w in &mut self.0 {
             w.fed_s = now_s;
         }
     }
 
-    /// All go away when the program stops.
+    /// Removes all watchdogs; called when the program ends.
     pub(super) fn clear(&mut self) {
         self.0.clear();
     }
 
-    /// The input and the action of a watchdog that has not been fed in time.
+    /// Input and action of a watchdog whose input was not written in time.
     pub(super) fn expired(&self, now_s: f64) -> Option<(Field, WatchdogAction)> {
         self.0
             .iter()

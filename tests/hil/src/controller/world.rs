@@ -1,4 +1,4 @@
-//! Robot, oracle and record together, with the faults that are on: everything behind the sockets.
+//! Robot, judge, wire record and active faults: everything behind the sockets.
 
 use super::command::{Command, Port, WireAction};
 use super::judge::{Judge, Limits, StepSample};
@@ -19,25 +19,26 @@ const MAX_NOISE_BYTES: usize = 65_536;
 pub struct World {
     /// The robot.
     pub robot: Robot,
-    /// Who holds which RTDE input.
+    /// Ownership of RTDE inputs.
     pub owners: Ownership,
-    /// The oracle.
+    /// The judge of set-points and motion.
     pub judge: Judge,
-    /// The wire record, when one is written.
+    /// The wire record, if one is written.
     pub recorder: Option<Recorder>,
-    /// Answers of the RTDE server that differ.
+    /// Faults of the RTDE server.
     pub rtde_faults: RtdeFaults,
-    /// What happens to the bytes of each port.
+    /// Network faults of each port.
     pub wire_faults: BTreeMap<Port, WireFaults>,
-    /// What the server shall do with its connections.
+    /// Pending actions on connections.
     pub actions: Vec<WireAction>,
-    /// A jump of the reported position that ends at this step.
+    /// Step at which a jump of the reported position ends.
     jump_until: Option<u64>,
     random: u64,
 }
 
 impl World {
-    /// A world round `robot`. `client` are the rate (rad/s) and acceleration (rad/s^2) that a client promised to keep.
+    /// A world with `robot`. `client` holds the joint speed (rad/s) and acceleration (rad/s^2) that clients must not
+    /// exceed.
     pub fn new(robot: Robot, client: Option<(f64, f64)>, recorder: Option<Recorder>) -> Self {
         let model = robot.setup.model;
         let (rate, accel) = client.unwrap_or((model.max_speed.iter().copied().fold(0.0, f64::max), f64::INFINITY));
@@ -56,7 +57,7 @@ impl World {
         }
     }
 
-    /// One control step at time `now_ns`.
+    /// Runs one control step at time `now_ns`.
     pub fn step(&mut self, now_ns: u64) {
         if self.jump_until.is_some_and(|end| self.robot.steps >= end) {
             self.robot.report_fault.offset = [0.0; 6];
@@ -76,7 +77,7 @@ impl World {
         }
     }
 
-    /// An input package took effect.
+    /// Judges and records an input package.
     pub fn note_input(judge: &mut Judge, recorder: &mut Option<Recorder>, now_ns: u64, package: &InputPackage) {
         judge.input(now_ns, &package.values);
         if let Some(recorder) = recorder {
@@ -84,14 +85,14 @@ impl World {
         }
     }
 
-    /// Notes an event in the record.
+    /// Records an event.
     pub fn note(&mut self, now_ns: u64, text: &str) {
         if let Some(recorder) = &mut self.recorder {
             recorder.note(now_ns, text);
         }
     }
 
-    /// A script came in.
+    /// Uploads a script and records the outcome.
     pub fn upload(&mut self, now_ns: u64, text: &str) -> Upload {
         let outcome = self.robot.upload(text);
         let first = text.lines().find(|l| !l.trim().is_empty()).unwrap_or("");
@@ -99,12 +100,12 @@ impl World {
         outcome
     }
 
-    /// Faults of one port's wires.
+    /// Network faults of one port.
     pub fn wire(&self, port: Port) -> WireFaults {
         self.wire_faults.get(&port).cloned().unwrap_or_default()
     }
 
-    /// A repeatable random number in [0, 1).
+    /// A reproducible random number in [0, 1).
     pub fn random(&mut self) -> f64 {
         self.random ^= self.random << 13;
         self.random ^= self.random >> 7;
@@ -112,7 +113,7 @@ impl World {
         (self.random >> 11) as f64 / (1u64 << 53) as f64
     }
 
-    /// State and summary, for the control port.
+    /// The robot's state, for the control port.
     pub fn state(&self) -> Json {
         let r = &self.robot;
         json!({
@@ -142,10 +143,10 @@ impl World {
         })
     }
 
-    /// Carries out a command of the control port.
+    /// Executes a command of the control port.
     ///
     /// # Errors
-    /// In words, when the command cannot be carried out in this state.
+    /// The reason for which the command cannot be executed.
     pub fn command(&mut self, command: Command, now_ns: u64) -> Result<Json, String> {
         let text = serde_json::to_string(&command).unwrap_or_default();
         let is_query = matches!(command, Command::State | Command::Summary | Command::Ping);

@@ -1,4 +1,4 @@
-//! The controller half of motion: commands in, target joint positions out, one step at a time.
+//! The motion generator: motion commands in, joint targets out, one control step at a time.
 
 use super::motion::{MAX_TARGET_ACCEL, Motion, REDUCED_SPEED_FRACTION, SAFETY_DECEL, StopCause};
 use super::path::CartesianPath;
@@ -11,7 +11,7 @@ use nalgebra::{Isometry3, Vector3, Vector6};
 pub(super) enum Active {
     Rest,
     Follow(Motion),
-    /// To rest at the given rate, then perhaps a move.
+    /// Decelerating to rest (rad/s^2 of the leading joint), then an optional move.
     Brake(f64, Option<Motion>),
     Joint {
         from: Joints,
@@ -27,7 +27,7 @@ pub(super) enum Active {
 /// Largest rate of change of the speed scaling, 1/s.
 const SCALING_SLEW_PER_S: f64 = 5.0;
 
-/// The motion generator: targets of six joints.
+/// Generates the targets of six joints.
 #[derive(Clone, Debug)]
 pub struct Generator {
     pub(super) q: Joints,
@@ -74,22 +74,22 @@ impl Generator {
         &self.qdd
     }
 
-    /// Speed scaling now in force, 0 to 1.
+    /// Present speed scaling, 0 to 1.
     pub fn scaling(&self) -> f64 {
         self.scaling
     }
 
-    /// `flange_from_tcp` used by tool motions.
+    /// Sets `flange_from_tcp` of tool motions.
     pub fn set_tool(&mut self, flange_from_tcp: Isometry3<f64>) {
         self.tool = flange_from_tcp;
     }
 
-    /// Halves the joint speed limits (a set-point beyond them is scaled down), or restores them.
+    /// Sets or ends reduced mode: half the joint speed limits; set-points beyond them are scaled down.
     pub fn set_reduced(&mut self, reduced: bool) {
         self.reduced = reduced;
     }
 
-    /// Starts a motion in place of the one before. A move begins after the arm came to rest.
+    /// Starts a motion, replacing the present one. A move begins once the arm is at rest.
     pub fn start(&mut self, motion: Motion) {
         self.active = match motion {
             Motion::SpeedJ { .. } | Motion::SpeedL { .. } | Motion::Servo { .. } | Motion::StopL { .. } => {
@@ -101,24 +101,24 @@ impl Generator {
         };
     }
 
-    /// Brings the joints to rest as the safety system does.
+    /// Stops the joints with the deceleration of the safety system.
     pub fn safety_stop(&mut self) {
         self.active = Active::Brake(SAFETY_DECEL, None);
     }
 
-    /// Puts the targets on the joints, at rest: after power came back or brakes opened.
+    /// Sets the targets to joint positions, at rest: after power on or brake release.
     pub fn snap(&mut self, q: Joints) {
         (self.q, self.qd, self.qdd, self.active) = (q, [0.0; 6], [0.0; 6], Active::Rest);
     }
 
-    /// Brings a move to rest half way; speed and servo motions go on.
+    /// Stops a move before its end; speed and servo motions continue.
     pub fn abandon_move(&mut self) {
         if matches!(self.active, Active::Joint { .. } | Active::Tool { .. } | Active::Brake(_, Some(_))) {
             self.active = Active::Brake(4.0, None);
         }
     }
 
-    /// Whether the motion has reached what it wanted: the end, rest, or the speed asked for.
+    /// Whether the motion has reached its goal: the end of the path, rest, or the commanded speed.
     pub fn is_settled(&self) -> bool {
         match &self.active {
             Active::Rest => true,
@@ -139,12 +139,12 @@ impl Generator {
         }
     }
 
-    /// Whether all targets stand still.
+    /// Whether all target speeds are zero.
     pub fn at_rest(&self) -> bool {
         self.qd.iter().all(|v| v.abs() < 1e-6)
     }
 
-    /// Fraction of the move that is done, 0 to 1; 1 when no move is under way.
+    /// Completed fraction of the move, 0 to 1; 1 if no move is under way.
     pub fn progress(&self) -> f64 {
         match &self.active {
             Active::Joint { profile, .. } | Active::Tool { profile, .. } => profile.fraction(),
@@ -153,15 +153,16 @@ impl Generator {
         }
     }
 
-    /// Velocity of the tool by the targets: linear then angular, base.
+    /// Tool velocity of the targets: linear then angular, base frame.
     pub fn tool_velocity(&self) -> [f64; 6] {
         (self.kinematics.jacobian(&self.q, &self.tool) * Vector6::from_column_slice(&self.qd)).into()
     }
 
-    /// One control step. `wanted_scaling` (0 to 1) slows everything but a stop. Bounded work: at most one inverse kinematics.
-    pub fn step(&mut self, dt: f64, wanted_scaling: f64) -> Result<(), StopCause> {
+    /// Advances by one control step. `requested_scaling` (0 to 1) slows every motion except stops. Computes at most one
+    /// inverse kinematics solution.
+    pub fn step(&mut self, dt: f64, requested_scaling: f64) -> Result<(), StopCause> {
         let slew = SCALING_SLEW_PER_S * dt;
-        self.scaling += (wanted_scaling.clamp(0.0, 1.0) - self.scaling).clamp(-slew, slew);
+        self.scaling += (requested_scaling.clamp(0.0, 1.0) - self.scaling).clamp(-slew, slew);
         let (q, qd) = (self.q, self.qd);
         let result = self.advance(dt);
         if result.is_err() {
@@ -171,7 +172,7 @@ impl Generator {
         }
         let result = result.and_then(|()| self.check(dt));
         if matches!(result, Err(StopCause::JointSpeed { .. })) {
-            // A target beyond the limit never reaches the drives: the stop begins from the one before.
+            // A target beyond the limit must not reach the drives: the stop begins from the previous target.
             (self.q, self.qd) = (q, qd);
             self.brake(SAFETY_DECEL, dt);
         }
@@ -215,12 +216,12 @@ impl Generator {
         self.scaling * if self.reduced { REDUCED_SPEED_FRACTION } else { 1.0 }
     }
 
-    /// Turns a waiting move into a path from where the arm now rests.
+    /// Plans a move from the present position, where the arm is at rest.
     fn plan(&self, motion: Motion) -> Active {
         match motion {
             Motion::MoveJ { q, accel, speed, duration } => {
                 let far = (0..6).map(|i| (q[i] - self.q[i]).abs()).fold(0.0, f64::max);
-                // A joint slower than the leading one's speed may still be beyond its own limit: the whole move slows down.
+                // Joints have different speed limits: the move is slowed down until no joint exceeds its own.
                 let allowed = (0..6)
                     .map(|i| self.max_speed[i] * far / (q[i] - self.q[i]).abs().max(1e-12))
                     .fold(speed.abs(), f64::min);
@@ -240,12 +241,12 @@ impl Generator {
         }
     }
 
-    /// Tool pose by the targets.
+    /// Tool pose of the targets.
     pub fn tool_pose(&self) -> Isometry3<f64> {
         self.kinematics.forward(&self.q) * self.tool
     }
 
-    /// Speed limits, and position limits with room left to brake.
+    /// Checks speed limits, and position limits with the braking distance.
     fn check(&mut self, dt: f64) -> Result<(), StopCause> {
         for i in 0..6 {
             let (q, qd, limit) = (self.q[i], self.qd[i], self.max_speed[i]);
@@ -258,7 +259,7 @@ impl Generator {
                 continue;
             };
             if matches!(self.active, Active::Brake(_, None)) {
-                continue; // already stopping
+                continue; // the arm is stopping already
             }
             self.safety_stop();
             return Err(cause);
@@ -287,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn speedj_keeps_moving_until_told_otherwise() {
+    fn speedj_continues_until_the_next_motion() {
         let mut g = generator();
         g.start(Motion::SpeedJ { qd: [0.2, 0.0, -0.1, 0.0, 0.0, 0.0], accel: 2.0 });
         run(&mut g, 2.0).unwrap();
@@ -299,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn movej_and_movel_arrive_where_they_were_sent() {
+    fn movej_and_movel_reach_their_targets() {
         let mut g = generator();
         let to = [0.5, -1.0, 1.2, -1.0, 1.3, 0.0];
         g.start(Motion::MoveJ { q: to, accel: 1.4, speed: 1.05, duration: 0.0 });
@@ -341,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn runs_into_no_end_stop_and_no_speed_limit() {
+    fn stops_before_position_and_speed_limits() {
         let mut g = generator();
         g.start(Motion::SpeedJ { qd: [2.0, 0.0, 0.0, 0.0, 0.0, 0.0], accel: 10.0 });
         assert!(matches!(run(&mut g, 4.0), Err(StopCause::JointPosition { joint: 0, .. })));
@@ -353,7 +354,7 @@ mod tests {
     }
 
     #[test]
-    fn the_slider_slows_and_reduced_mode_caps() {
+    fn the_slider_scales_and_reduced_mode_limits_the_speed() {
         let mut g = generator();
         g.start(Motion::SpeedJ { qd: [1.0; 6], accel: 10.0 });
         for _ in 0..500 {

@@ -1,8 +1,8 @@
-//! The arm that the mock controller moves: kinematics, motion generators, joint dynamics.
+//! The arm of the mock controller: kinematics, motion generator, joint dynamics.
 //!
-//! The controller half (`Generator`) turns motion commands into target positions once a step, as a real controller does; the
-//! mechanical half (`Drives`) follows those targets with lag, limited acceleration and quantised encoders. Nothing here reads a
-//! clock or a socket: `dt` is an argument.
+//! The controller part ([`Generator`]) turns motion commands into joint targets, one control step at a time. The mechanical
+//! part ([`Drives`]) follows the targets with lag, limited acceleration and quantised encoders. Nothing reads a clock or a
+//! socket: `dt` is an argument.
 
 mod drives;
 mod generator;

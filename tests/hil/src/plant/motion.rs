@@ -11,17 +11,17 @@ pub(super) const MAX_TOOL_ACCEL: f64 = 150.0;
 /// Fraction of the joint speed limits that is left in reduced mode.
 pub(super) const REDUCED_SPEED_FRACTION: f64 = 0.5;
 
-/// A motion command, as the URScript call of the same name gives it.
+/// A motion command, with the arguments of the URScript call of the same name.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Motion {
-    /// `speedj`: reach and KEEP these joint rates (rad/s) until another motion; the leading axis accelerates at `accel`.
+    /// `speedj`: reach and KEEP these joint speeds until another motion; the leading axis accelerates at `accel`.
     SpeedJ {
-        /// Joint rates, rad/s.
+        /// Joint speeds, rad/s.
         qd: Joints,
         /// Acceleration of the leading axis, rad/s^2.
         accel: f64,
     },
-    /// `speedl`: reach and keep this tool velocity (linear then angular, base).
+    /// `speedl`: reach and keep this tool velocity (linear then angular, base frame).
     SpeedL {
         /// m/s and rad/s.
         twist: [f64; 6],
@@ -30,16 +30,16 @@ pub enum Motion {
         /// Angular acceleration, rad/s^2.
         rot_accel: f64,
     },
-    /// `servoj`: follow a joint position with about `lookahead` seconds of delay.
+    /// `servoj`: follow a joint position with a delay of about `lookahead`.
     Servo {
         /// Joint positions, rad.
         q: Joints,
         /// Smoothing time, s.
         lookahead: f64,
-        /// Proportional gain; 300 is the default.
+        /// Proportional gain; URScript's default is 300.
         gain: f64,
     },
-    /// `movej`: to joint positions, straight in joint space.
+    /// `movej`: move to joint positions, linearly in joint space.
     MoveJ {
         /// Joint positions, rad.
         q: Joints,
@@ -47,37 +47,37 @@ pub enum Motion {
         accel: f64,
         /// rad/s.
         speed: f64,
-        /// s; 0 leaves `speed` in charge.
+        /// Duration, s; 0 if the speed determines it.
         duration: f64,
     },
-    /// `movel` and `movep`: the tool to a pose (x, y, z, rotation vector), straight in space.
+    /// `movel` and `movep`: move the tool to a pose (x, y, z, rotation vector) along a straight line.
     MoveL {
-        /// Tool pose in base.
+        /// Tool pose in the base frame.
         pose: [f64; 6],
         /// m/s^2.
         accel: f64,
         /// m/s.
         speed: f64,
-        /// s; 0 leaves `speed` in charge.
+        /// Duration, s; 0 if the speed determines it.
         duration: f64,
     },
-    /// `movec`: the tool along the circle through `via`.
+    /// `movec`: move the tool along the circle through `via`.
     MoveC {
-        /// A pose on the way; only its position counts.
+        /// A pose on the circle; only its position is used.
         via: [f64; 6],
-        /// Tool pose at the end, base.
+        /// Tool pose at the end, base frame.
         pose: [f64; 6],
         /// m/s^2.
         accel: f64,
         /// m/s.
         speed: f64,
     },
-    /// `stopj`: joints to rest.
+    /// `stopj`: decelerate the joints to rest.
     StopJ {
         /// rad/s^2.
         decel: f64,
     },
-    /// `stopl`: tool to rest along its direction.
+    /// `stopl`: decelerate the tool to rest along its direction.
     StopL {
         /// m/s^2.
         decel: f64,
@@ -89,8 +89,8 @@ pub enum Motion {
 /// Why the controller itself stops the arm.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum StopCause {
-    /// A joint was asked to turn faster than it may.
-    #[error("joint {joint} asked to turn at {speed:.3} rad/s, limit {limit:.3}")]
+    /// A joint target exceeds the speed limit.
+    #[error("joint {joint}: target speed {speed:.3} rad/s exceeds the limit of {limit:.3} rad/s")]
     JointSpeed {
         /// 0 is the base.
         joint: usize,
@@ -99,23 +99,23 @@ pub enum StopCause {
         /// rad/s.
         limit: f64,
     },
-    /// A joint is about to run into its end stop.
-    #[error("joint {joint} at {position:.4} rad is close to its limit")]
+    /// A joint could not stop before its position limit.
+    #[error("joint {joint}: position {position:.4} rad is too close to its limit")]
     JointPosition {
         /// 0 is the base.
         joint: usize,
         /// rad.
         position: f64,
     },
-    /// A joint does not follow its target.
-    #[error("position of joint {joint} deviates from path by {deviation:.4} rad")]
+    /// A joint deviates too far from its target.
+    #[error("joint {joint}: position deviates from its target by {deviation:.4} rad")]
     PathDeviation {
         /// 0 is the base.
         joint: usize,
         /// rad.
         deviation: f64,
     },
-    /// A tool path leaves the reach of the arm.
-    #[error("no inverse kinematics on the way to the target pose")]
+    /// A tool path leaves the workspace of the arm.
+    #[error("the path to the target pose has a point without inverse kinematics solution")]
     Unreachable,
 }

@@ -6,14 +6,14 @@ use super::motion::{MAX_TARGET_ACCEL, MAX_TOOL_ACCEL, Motion, REDUCED_SPEED_FRAC
 use nalgebra::{Vector3, Vector6};
 
 impl Generator {
-    /// Slows the joints, the leading one at `decel`; true at rest.
+    /// Decelerates the joints, the leading one at `decel`; true once they are at rest.
     pub(super) fn brake(&mut self, decel: f64, dt: f64) -> bool {
         let goal = [0.0; 6];
         self.approach(&goal, decel, dt);
         self.qd.iter().all(|v| *v == 0.0)
     }
 
-    /// Moves the joint speeds straight towards `goal`, the leading axis at `accel`, and integrates.
+    /// Changes the joint speeds in a straight line towards `goal`, the leading axis at `accel`, and integrates.
     fn approach(&mut self, goal: &Joints, accel: f64, dt: f64) {
         let most = accel.abs().clamp(1e-3, MAX_TARGET_ACCEL) * dt;
         let delta: Joints = std::array::from_fn(|i| goal[i] - self.qd[i]);
@@ -21,8 +21,8 @@ impl Generator {
         if lead <= most {
             self.qd = *goal;
         } else {
-            let share = most / lead;
-            self.qd = std::array::from_fn(|i| self.qd[i] + delta[i] * share);
+            let fraction = most / lead;
+            self.qd = std::array::from_fn(|i| self.qd[i] + delta[i] * fraction);
         }
         for i in 0..6 {
             self.q[i] += self.qd[i] * dt;
@@ -44,7 +44,7 @@ impl Generator {
             }
             Motion::Servo { q, lookahead, gain } => {
                 let settle = (lookahead.clamp(0.03, 0.2) * (300.0 / gain.clamp(100.0, 2000.0)).sqrt()).max(2.0 * dt);
-                // As fast as the lookahead asks, but never faster than the arm can still brake.
+                // The speed that the lookahead requires, limited by the braking distance to the target.
                 let goal = std::array::from_fn(|i| {
                     let e = q[i] - self.q[i];
                     let can_brake = (2.0 * 0.8 * MAX_TARGET_ACCEL * e.abs()).sqrt();
@@ -71,14 +71,14 @@ impl Generator {
             let have = now.fixed_rows::<3>(rows).into_owned();
             let delta = goal - have;
             let most = rate.max(1e-3) * dt;
-            let share = if delta.norm() <= most { 1.0 } else { most / delta.norm() };
-            next.fixed_rows_mut::<3>(rows).copy_from(&(have + delta * share));
+            let fraction = if delta.norm() <= most { 1.0 } else { most / delta.norm() };
+            next.fixed_rows_mut::<3>(rows).copy_from(&(have + delta * fraction));
         }
         let goal = self.reduce(self.kinematics.joint_rates(&self.q, &self.tool, &next.into()));
         self.approach(&goal, MAX_TARGET_ACCEL, dt);
     }
 
-    /// Scales joint rates into the reduced limits, keeping their direction.
+    /// Scales joint speeds down to the reduced limits, keeping their direction.
     fn reduce(&self, qd: Joints) -> Joints {
         if !self.reduced {
             return qd;

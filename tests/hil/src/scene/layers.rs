@@ -1,4 +1,4 @@
-//! The fixed layers of one view, rendered once: what lies behind the valve, the valve itself with its coverage, and its depth.
+//! The fixed layers of one view, rendered once: the backdrop, and the valve with its coverage and depth.
 
 use super::raster::Rect;
 use super::sensor::{SCALE, Sensor};
@@ -14,24 +14,24 @@ const MAX_GREY_STEP: f64 = 5.0;
 /// Difference of distance between neighbouring pixels of the valve above which both are supersampled, m.
 const MAX_DEPTH_STEP_M: f64 = 4e-3;
 
-/// The fixed layers of one view. Greys are linear and not yet blurred, except in `exposed`.
+/// The fixed layers of one view. Grey values are linear and not blurred, except in `exposed`.
 #[derive(Debug)]
 pub(super) struct Layers {
     /// Width in pixels.
     pub(super) width: usize,
     /// Height in pixels.
     pub(super) height: usize,
-    /// Grey of everything behind the valve.
+    /// Grey values behind the valve.
     pub(super) backdrop: Vec<f32>,
-    /// The pixels that the valve touches.
+    /// Bounding rectangle of the valve.
     pub(super) valve_rect: Rect,
-    /// Per pixel of `valve_rect`: grey times coverage, coverage, and distance along the ray.
+    /// Per pixel of `valve_rect`: grey value times coverage, coverage, and distance along the ray, m.
     pub(super) valve: Vec<[f32; 3]>,
-    /// Unit rays of `valve_rect`'s pixel centres in the camera frame.
+    /// Viewing rays of the pixel centres of `valve_rect` in the camera frame.
     pub(super) rays: Vec<Vec3>,
-    /// Light that arrives, by the lens.
+    /// Relative illumination by the lens.
     pub(super) falloff: Vec<f32>,
-    /// The blurred image without gripper in 64ths of a grey value, and each pixel's noise amplitude.
+    /// Blurred image without gripper in 64ths of a grey value, and the noise amplitude of each pixel.
     pub(super) exposed: (Vec<i16>, Vec<i16>),
 }
 
@@ -80,7 +80,7 @@ impl Layers {
         layers
     }
 
-    /// Grey of the fixed scene at a pixel, not blurred.
+    /// Unblurred grey value of the fixed scene at a pixel.
     pub(super) fn still(&self, x: usize, y: usize) -> f32 {
         let b = self.backdrop[y * self.width + x];
         match self.valve_at(x, y) {
@@ -89,7 +89,7 @@ impl Layers {
         }
     }
 
-    /// Valve layer and ray at a pixel, where the valve could be.
+    /// Valve layer and viewing ray at a pixel inside `valve_rect`.
     #[inline]
     pub(super) fn valve_at(&self, x: usize, y: usize) -> Option<(&[f32; 3], &Vec3)> {
         let r = &self.valve_rect;
@@ -232,14 +232,14 @@ impl<'a> Tracer<'a> {
     }
 }
 
-/// Blurs an image of rows of `width` in place with a symmetric kernel (centre first); borders repeat.
+/// Blurs an image with rows of `width` pixels in place by a symmetric kernel (centre first); border pixels are repeated.
 pub(super) fn blur(image: &mut [f32], width: usize, kernel: &[f32], scratch: &mut Vec<f32>) {
     let n = kernel.len() - 1;
     if n == 0 || width == 0 {
         return;
     }
     let height = image.len() / width;
-    // Rows, through a padded copy of each.
+    // Rows, each through a padded copy.
     scratch.clear();
     scratch.resize(width + 2 * n, 0.0);
     for row in image.chunks_exact_mut(width) {
@@ -256,7 +256,7 @@ pub(super) fn blur(image: &mut [f32], width: usize, kernel: &[f32], scratch: &mu
             }
         }
     }
-    // Columns, row by row: a ring would save memory, a copy is simpler and as fast.
+    // Columns, processed row by row from a copy of the image.
     scratch.clear();
     scratch.extend_from_slice(image);
     for y in 0..height {

@@ -1,4 +1,4 @@
-//! The tree between parser and compiler. Its depth is bounded by the parser, so walking and dropping it recurses safely.
+//! Syntax tree. Its depth is bounded by the parser, so recursion over it is safe.
 
 use super::value::Value;
 
@@ -29,7 +29,7 @@ pub(crate) enum UnaryOp {
 pub(crate) struct Expr {
     pub(crate) kind: ExprKind,
     pub(crate) line: u32,
-    /// Height of the tree below; bounded.
+    /// Height of the tree; bounded.
     pub(crate) depth: u32,
 }
 

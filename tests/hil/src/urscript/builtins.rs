@@ -1,4 +1,4 @@
-//! Built-in functions that reach the controller: registers, motion, kinematics, state, outputs, pendant.
+//! Built-in functions that access the controller: registers, motion, kinematics, state, outputs, pendant.
 
 use super::arithmetic::Outcome;
 use super::error::HostError;
@@ -15,7 +15,7 @@ const REGISTERS: usize = 48;
 /// Boolean registers of either bank.
 const BITS: usize = 128;
 
-/// Functions that are accepted, checked by the host and recorded, without a meaning in the interpreter.
+/// Settings that are passed to the host and have no meaning in the interpreter.
 const SETTINGS: [&str; 25] = [
     "force_mode",
     "end_force_mode",
@@ -48,7 +48,7 @@ fn refused(e: HostError) -> String {
     e.to_string()
 }
 
-/// Begins a call. `free`: no other thread's motion is under way.
+/// Begins a call. `free` is false while another thread's motion is under way.
 pub(crate) fn begin(
     name: &str,
     given: Vec<Value>,
@@ -90,7 +90,7 @@ pub(crate) fn begin(
             if seconds <= 0.0 {
                 return Ok(Flow::Value(Value::None));
             }
-            // The small share keeps 0.1 s at 2 ms from becoming 51 steps by rounding.
+            // The small margin keeps 0.1 s at 2 ms from being rounded up to 51 steps.
             Ok(Flow::Wait(Wait::Steps((seconds / host.step_time() - 1e-6).ceil().clamp(1.0, 1e9) as u32)))
         }
         "popup" => {
@@ -108,7 +108,7 @@ pub(crate) fn begin(
     }
 }
 
-/// Goes on with a call that blocks, once in each control step.
+/// Continues a blocking call, once in each control step.
 pub(crate) fn resume(wait: Wait, host: &mut dyn Host, buffers: &mut SocketBuffers) -> Outcome<Flow> {
     match wait {
         Wait::Steps(n) if n > 1 => Ok(Flow::Wait(Wait::Steps(n - 1))),
@@ -128,7 +128,7 @@ fn target(v: &Value) -> Outcome<Target> {
     Ok(if matches!(v, Value::Pose(_)) { Target::Pose(values) } else { Target::Joints(values) })
 }
 
-/// The motion of a motion call; `None` if `name` is none.
+/// The motion of a motion call; `None` if `name` is not one.
 fn motion(name: &str, a: &[Value], host: &dyn Host) -> Option<Outcome<Motion>> {
     let none = Value::None;
     let at = |i: usize| a.get(i).unwrap_or(&none);
@@ -160,7 +160,7 @@ fn motion(name: &str, a: &[Value], host: &dyn Host) -> Option<Outcome<Motion>> {
 fn optional_six(v: &Value) -> Outcome<Option<[f64; 6]>> {
     match v {
         Value::None => Ok(None),
-        // UR's name for "the tool that is active".
+        // UR's name of the active TCP.
         Value::Str(s) if s == "active_tcp" => Ok(None),
         other => six(other).map(Some),
     }
@@ -193,7 +193,7 @@ fn immediate(name: &str, a: &[Value], host: &mut dyn Host) -> Outcome {
         }
         "get_inverse_kin" => {
             let found = host.inverse_kinematics(&query(a)?);
-            Value::floats(&found.ok_or("get_inverse_kin: the pose cannot be reached")?)
+            Value::floats(&found.ok_or("get_inverse_kin: no solution, the pose is out of reach")?)
         }
         "get_inverse_kin_has_solution" => Value::Bool(host.inverse_kinematics(&query(a)?).is_some()),
         "get_jacobian" => {
@@ -251,7 +251,7 @@ fn immediate(name: &str, a: &[Value], host: &mut dyn Host) -> Outcome {
             host.set_watchdog(text(x)?, finite(y)?, action).map_err(refused)?;
             Value::None
         }
-        // Known by its arguments, answered by whoever hosts the program.
+        // Arguments are bound here; the host evaluates the function.
         _ => return host.call(name, a).map_err(refused),
     })
 }
@@ -260,9 +260,9 @@ fn three(v: &Value) -> Outcome<[f64; 3]> {
     match v {
         Value::List(items) => match items.as_slice() {
             [x, y, z] => Ok([finite(x)?, finite(y)?, finite(z)?]),
-            _ => Err("three numbers are needed".to_owned()),
+            _ => Err("expected three numbers".to_owned()),
         },
-        _ => Err(format!("three numbers are needed, this is {}", v.type_name())),
+        _ => Err(format!("expected three numbers, got {}", v.type_name())),
     }
 }
 

@@ -1,4 +1,4 @@
-//! Tree to a stack machine's code: an explicit stack lets a script block in the middle of nested calls.
+//! Compiler from the syntax tree to code of a stack machine. The explicit stack lets a script block within nested calls.
 
 use super::ast::{BinaryOp, Expr, ExprKind, Function, FunctionKind, Scope, Stmt, StmtKind, UnaryOp};
 use super::error::ScriptError;
@@ -13,7 +13,7 @@ pub(crate) enum Op {
     Push(Value),
     Load(NameId),
     Store(Scope, NameId),
-    /// Value on top, then `n` indices below it.
+    /// Operands: the value on top, `n` indices below it.
     StoreIndex(NameId, usize),
     MakeList(usize),
     MakePose,
@@ -22,13 +22,13 @@ pub(crate) enum Op {
     Binary(BinaryOp),
     Jump(usize),
     JumpIfFalse(usize),
-    /// For `and` and `or`: jumps with the value kept if it equals the flag, else drops it.
+    /// For `and` and `or`: if the top equals the flag, keeps it and jumps; otherwise drops it.
     ShortCircuit(bool, usize),
-    /// Fails unless the top is a boolean (right side of `and` and `or`).
+    /// Fails unless the top is a boolean (right operand of `and` and `or`).
     CheckBool,
-    /// For default arguments: skip if the parameter was given.
+    /// For default arguments: jumps if the parameter was given.
     JumpIfSet(NameId, usize),
-    /// Callee and names of the arguments.
+    /// Callee, and the names of named arguments.
     CallUser(usize, Vec<Option<NameId>>),
     CallBuiltin(String, Vec<Option<String>>),
     Run(usize),
@@ -55,7 +55,7 @@ pub(crate) struct Routine {
     children: HashMap<String, usize>,
 }
 
-/// A compiled upload; routine 0 is the text's first level.
+/// A compiled upload; routine 0 is the top level of the text.
 #[derive(Debug)]
 pub(crate) struct Program {
     pub(crate) routines: Vec<Routine>,
@@ -93,7 +93,7 @@ pub(crate) fn compile(text: &[Stmt]) -> Result<Program, ScriptError> {
             }
             (c.routines.first().and_then(|r| r.children.get(&only.name)).copied().unwrap_or(0), Some(only.kind))
         }
-        _ if text.is_empty() => return Err(ScriptError::new(1, "there is no statement in this program")),
+        _ if text.is_empty() => return Err(ScriptError::new(1, "the program has no statement")),
         _ => (0, None),
     };
     Ok(Program { routines: c.routines, names: c.names, entry, kind })
@@ -139,7 +139,7 @@ impl Compiler {
         None
     }
 
-    /// Functions of a body are visible in all of it, also in the blocks within; so they are declared before code is made.
+    /// Declares the functions of a body before code is generated, because they are visible in the whole body.
     fn declare<'s>(&mut self, r: usize, body: &'s [Stmt], found: &mut Vec<(usize, &'s Function)>) {
         for s in body {
             match &s.kind {
@@ -264,7 +264,7 @@ impl Compiler {
                 if matches!(s.kind, StmtKind::Kill(_)) {
                     self.emit(r, line, Op::Kill);
                 } else {
-                    // Every wait leaves a value, so does join.
+                    // Every wait leaves a value, including join.
                     self.emit(r, line, Op::Join);
                     self.emit(r, line, Op::Pop);
                 }
@@ -323,17 +323,14 @@ impl Compiler {
                         Op::CallUser(f, names)
                     }
                     Some(_) => {
-                        return Err(ScriptError::new(
-                            line,
-                            format!("'{name}' is a thread: it is started by run, not called"),
-                        ));
+                        return Err(ScriptError::new(line, format!("'{name}' is a thread: start it with run")));
                     }
                     None => Op::CallBuiltin(name.clone(), arguments.iter().map(|a| a.name.clone()).collect()),
                 }
             }
             ExprKind::Run(name) => match self.resolve(r, name) {
                 Some(f) if self.routines[f].kind == Some(FunctionKind::Thread) => Op::Run(f),
-                _ => return Err(ScriptError::new(line, format!("there is no thread '{name}' to run here"))),
+                _ => return Err(ScriptError::new(line, format!("run: there is no thread '{name}' in this scope"))),
             },
         };
         self.emit(r, line, op);

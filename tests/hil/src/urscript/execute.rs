@@ -180,18 +180,18 @@ impl Machine {
     fn pop_bool(&mut self, i: usize) -> Result<bool, String> {
         match self.pop(i) {
             Value::Bool(b) => Ok(b),
-            other => Err(format!("a condition must be a boolean, this is {}", other.type_name())),
+            other => Err(format!("a condition must be a boolean, got {}", other.type_name())),
         }
     }
 
-    /// What `if` and `while` look at: UR's own driver script writes `if has_qnear:` with a number, so a number that is not zero
-    /// holds. `and`, `or` and `not` take booleans only.
+    /// Condition of `if` and `while`. UR's own driver script uses a number (`if has_qnear:`), so a number other than zero is true.
+    /// `and`, `or` and `not` accept booleans only.
     fn pop_condition(&mut self, i: usize) -> Result<bool, String> {
         match self.pop(i) {
             Value::Int(n) => Ok(n != 0),
             Value::Float(x) => Ok(x != 0.0),
             Value::Bool(b) => Ok(b),
-            other => Err(format!("a condition must be a boolean, this is {}", other.type_name())),
+            other => Err(format!("a condition must be a boolean, got {}", other.type_name())),
         }
     }
 
@@ -206,7 +206,7 @@ impl Machine {
         frame.locals.iter().find(|(n, _)| *n == name).map(|(_, v)| v).or_else(|| self.globals.get(name)?.as_ref())
     }
 
-    /// Where an assignment goes: a local of that name, else a global, else a new local; the program's first level is global.
+    /// Assigns to a local of that name, else to a global, else to a new local. The top level of the program is global.
     fn assign(&mut self, i: usize, scope: Scope, name: NameId, value: Value) {
         let entry = self.program.entry;
         let global_exists = self.globals.get(name).is_some_and(Option::is_some);
@@ -240,9 +240,9 @@ impl Machine {
                 }
                 Ok(())
             }
-            // Scripts keep 0 for "no thread" and kill it without asking.
+            // Scripts use 0 for "no thread" and kill it unconditionally.
             Value::Int(0) => Ok(()),
-            other => Err(format!("kill needs a thread, this is {}", other.type_name())),
+            other => Err(format!("kill needs a thread, got {}", other.type_name())),
         }
     }
 

@@ -1,4 +1,4 @@
-//! Expressions: `or`, `xor`, `and`, `not`, comparison, sum, product, sign, index, call; loosest first.
+//! Parser of expressions. Precedence, lowest first: `or`, `xor`, `and`, `not`, comparison, sum, product, sign, index and call.
 
 use super::ast::{Argument, BinaryOp, Expr, ExprKind, UnaryOp};
 use super::error::ScriptError;
@@ -6,7 +6,7 @@ use super::lexer::Token;
 use super::parser::Parser;
 use super::value::Value;
 
-/// Height of an expression's tree, chains of operators included.
+/// Height of an expression's tree; a chain of operators adds one level per operator.
 const MAX_DEPTH: u32 = 200;
 /// Elements of a literal list.
 const MAX_ELEMENTS: usize = 10_000;
@@ -154,7 +154,7 @@ impl Parser<'_> {
         node(ExprKind::Index(Box::new(base), path), line, below)
     }
 
-    /// Expressions separated by commas, and the closing bracket.
+    /// Parses expressions separated by commas, and the closing bracket.
     fn items(&mut self, close: &str) -> Result<Vec<Expr>, ScriptError> {
         let mut out = Vec::new();
         while !self.is_symbol(close) {
@@ -171,7 +171,7 @@ impl Parser<'_> {
     }
 
     fn primary(&mut self) -> Result<Expr, ScriptError> {
-        // A value that is due may stand on a later line.
+        // A value may follow on a later line.
         while matches!(self.peek(), Some(Token::Newline)) {
             self.advance();
         }
@@ -214,7 +214,7 @@ impl Parser<'_> {
                     self.expect_symbol(")")?;
                     node(ExprKind::Run(name), line, 0)
                 }
-                // `p[...]` is a pose when six numbers follow; a variable called p keeps its index.
+                // `p[...]` with six elements is a pose; with one or two it indexes a variable named p.
                 "p" if matches!(self.peek_second(), Some(Token::Symbol("["))) => {
                     self.advance();
                     self.advance();
@@ -226,7 +226,7 @@ impl Parser<'_> {
                             let name = node(ExprKind::Name("p".to_owned()), line, 0)?;
                             node(ExprKind::Index(Box::new(name), items), line, below.max(1))
                         }
-                        n => Err(ScriptError::new(line, format!("a pose has six numbers, this one {n}"))),
+                        n => Err(ScriptError::new(line, format!("a pose needs six numbers, got {n}"))),
                     }
                 }
                 _ => {

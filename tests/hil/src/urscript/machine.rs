@@ -1,4 +1,4 @@
-//! The machine: threads of a program taking turns within one control step.
+//! The virtual machine: runs the threads of a program one after the other within a control step.
 
 use super::ast::FunctionKind;
 use super::builtins::resume;
@@ -12,27 +12,27 @@ use super::thread::Thread;
 use super::value::Value;
 use super::wait::{Flow, Wait};
 
-/// Instructions of one thread within one control step; beyond them it is taken to compute for ever.
+/// Instructions of one thread within one control step; a thread that exceeds them counts as an infinite loop.
 pub const MAX_INSTRUCTIONS: u32 = 50_000;
-/// Threads of a program, the main one included.
+/// Threads of a program, including the main one.
 pub const MAX_THREADS: usize = 64;
-/// Calls within calls.
+/// Depth of nested calls.
 pub const MAX_CALL_DEPTH: usize = 128;
-/// Values waiting on a thread's stack.
+/// Values on a thread's stack.
 const MAX_STACK: usize = 20_000;
 
-/// How an upload is meant to run.
+/// How an upload is run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ProgramKind {
     /// `def`: replaces the running program.
     Main,
-    /// `sec`: runs beside it and must take no controller time.
+    /// `sec`: runs in parallel and must take no controller time.
     Secondary,
-    /// Bare statements: a program of their own, replaces the running one.
+    /// Bare statements: a program that replaces the running one.
     Bare,
 }
 
-/// A loaded program and all its threads.
+/// A compiled program and its threads.
 pub struct Machine {
     pub(super) program: Program,
     pub(super) threads: Vec<Thread>,
@@ -44,19 +44,19 @@ pub struct Machine {
     ended: Option<StepOutcome>,
 }
 
-/// Why a thread's turn is over.
+/// Why a thread's turn has ended.
 enum Turn {
-    /// Waits for the next step, or is done.
+    /// It waits for the next step, or has ended.
     Over,
-    /// The whole program is done.
+    /// It executed `halt`, which ends the program.
     Halt,
 }
 
 impl Machine {
-    /// Reads a program as a controller does at upload. Nothing runs yet.
+    /// Compiles a program. Nothing runs yet.
     ///
     /// # Errors
-    /// The first thing that is not URScript, with its line.
+    /// The first error with its line; unknown names are reported together.
     pub fn load(text: &str) -> Result<Self, ScriptError> {
         let program = compile(&parse(&lex(text)?)?)?;
         let globals = vec![None; program.names.len()];
@@ -72,7 +72,7 @@ impl Machine {
         })
     }
 
-    /// How this upload is meant to run.
+    /// How this upload is run.
     #[must_use]
     pub fn kind(&self) -> ProgramKind {
         match self.program.kind {
@@ -95,28 +95,29 @@ impl Machine {
         self.globals.get(id)?.as_ref()
     }
 
-    /// Threads that are alive, the main one included.
+    /// Number of running threads, including the main one.
     #[must_use]
     pub fn threads(&self) -> usize {
         self.threads.len()
     }
 
-    /// Line at which the main thread stands.
+    /// Present line of the main thread.
     #[must_use]
     pub fn line(&self) -> u32 {
         self.threads.first().map_or(0, |f| self.line_of(f))
     }
 
-    /// Runs one control step. After `Finished` or `Failed` further calls only repeat the outcome.
+    /// Runs one control step. After `Finished` or `Failed` further calls repeat the outcome.
     pub fn step(&mut self, host: &mut dyn Host) -> StepOutcome {
         if let Some(ended) = &self.ended {
             return ended.clone();
         }
         let mut i = 0;
-        // Threads started in this step are appended and run in it; a cap on threads alive and dead bounds the loop.
+        // Threads started in this step are appended and run in it. The number of threads, including ended ones, is bounded.
         while i < self.threads.len() {
-            // A thread goes on until it waits, so nobody interrupts a critical section; while its thread waits inside it, the others
-            // run: UR's own driver script reads its socket inside one while its servo thread moves the arm.
+            // A thread runs until it waits, so a critical section is not interrupted between two waits. While its thread waits
+            // inside the section the other threads run: UR's own driver script reads its socket inside a critical section while
+            // its servo thread moves the arm.
             if self.threads[i].dead {
                 i += 1;
                 continue;
@@ -142,7 +143,7 @@ impl Machine {
         StepOutcome::Running
     }
 
-    /// Ends the program from outside (stop button, watchdog, replaced by another): its motion is abandoned, its sockets closed.
+    /// Stops the program (stop button, watchdog, another upload): abandons its motion and closes its sockets.
     pub fn stop(&mut self, host: &mut dyn Host) {
         if self.ended.is_none() {
             self.end(StepOutcome::Finished, host);
@@ -198,7 +199,7 @@ impl Machine {
                 self.threads[i].dead = true;
                 return Ok(Turn::Over);
             };
-            // Every routine ends in `Return`, so the address is always inside the code.
+            // Every routine ends with `Return`, so the address is valid.
             let op = self.program.routines[frame.routine].code[frame.at].clone();
             frame.at += 1;
             match op {

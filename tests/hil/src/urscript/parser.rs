@@ -1,13 +1,13 @@
-//! Tokens to a tree: statements and functions. Expressions are in `expression.rs`.
+//! Parser of statements and functions. Expressions are parsed in `expression.rs`.
 
 use super::ast::{Function, FunctionKind, Parameter, Scope, Stmt, StmtKind};
 use super::error::ScriptError;
 use super::lexer::{Lexed, Token};
 
-/// Nesting of blocks and brackets that is taken. Far above real scripts, far below a thread's stack.
+/// Nesting depth of blocks and brackets: far above real scripts, far below the stack limit of a thread.
 pub(crate) const MAX_NESTING: u32 = 48;
 
-/// Words that cannot name a variable or a function.
+/// Words that cannot be names of variables or functions.
 const KEYWORDS: [&str; 25] = [
     "def",
     "thread",
@@ -43,7 +43,7 @@ pub(crate) struct Parser<'t> {
     loops: u32,
 }
 
-/// Statements of the whole text.
+/// Parses the statements of a text.
 pub(crate) fn parse(tokens: &[Lexed]) -> Result<Vec<Stmt>, ScriptError> {
     let mut parser = Parser { tokens, at: 0, nesting: 0, loops: 0 };
     let body = parser.block(&[])?;
@@ -104,7 +104,7 @@ impl<'t> Parser<'t> {
         if self.take_symbol(symbol) { Ok(()) } else { Err(self.expected(&format!("'{symbol}'"))) }
     }
 
-    /// A name that is not a keyword.
+    /// Parses a name that is not a keyword.
     pub(crate) fn identifier(&mut self, what: &str) -> Result<String, ScriptError> {
         match self.peek() {
             Some(Token::Name(n)) if !KEYWORDS.contains(&n.as_str()) => {
@@ -123,7 +123,7 @@ impl<'t> Parser<'t> {
         Ok(())
     }
 
-    /// Statements up to one of the closing words (not taken), or to the end of the text where there are none.
+    /// Parses statements up to one of the closing words (not consumed), or to the end of the text if there are none.
     fn block(&mut self, closers: &[&str]) -> Result<Vec<Stmt>, ScriptError> {
         self.deeper()?;
         let opened = self.line();

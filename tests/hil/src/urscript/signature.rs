@@ -1,11 +1,11 @@
-//! Names, parameters and defaults of the built-in functions, and the binding of arguments to them.
+//! Names, parameters and defaults of the built-in functions, and the binding of arguments.
 
 use super::arithmetic::Outcome;
 use super::value::Value;
 
-/// `name` must be given, `name=default` need not; `name=?` has no value when it is left out.
+/// Parameters: `name` is required, `name=default` optional; `name=?` is optional without a default.
 const SIGNATURES: &[(&str, &str)] = &[
-    // Motion. Defaults of the script manual.
+    // Motion; defaults of the script manual.
     ("movej", "q a=1.4 v=1.05 t=0 r=0"),
     ("movel", "pose a=1.2 v=0.25 t=0 r=0"),
     ("movep", "pose a=1.2 v=0.25 r=0"),
@@ -63,7 +63,7 @@ const SIGNATURES: &[(&str, &str)] = &[
     ("get_controller_temp", ""),
     ("get_tool_current", ""),
     ("get_tool_accelerometer_reading", ""),
-    // Settings with a meaning for the plant.
+    // Settings that affect the plant.
     ("set_tcp", "pose tcp_name=''"),
     ("set_payload", "m cog=?"),
     ("set_payload_mass", "m"),
@@ -167,7 +167,7 @@ fn default(text: &str) -> Option<Value> {
     }
 }
 
-/// Arguments in the order of the parameters, defaults filled in; `None` if there is no built-in of this name.
+/// Arguments in the order of the parameters, with defaults filled in; `None` if there is no built-in of this name.
 pub(crate) fn bind(function: &str, given: Vec<Value>, names: &[Option<String>]) -> Option<Outcome<Vec<Value>>> {
     let (_, spec) = SIGNATURES.iter().find(|(n, _)| *n == function)?;
     let parameters: Vec<(&str, Option<&str>)> = spec
@@ -212,7 +212,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_default_can_be_read_and_no_name_is_listed_twice() {
+    fn defaults_are_valid_and_names_are_unique() {
         for (i, (name, spec)) in SIGNATURES.iter().enumerate() {
             assert!(SIGNATURES.iter().skip(i + 1).all(|(n, _)| n != name), "{name}");
             for p in spec.split_whitespace() {

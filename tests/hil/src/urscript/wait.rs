@@ -5,7 +5,7 @@ use super::value::Value;
 /// What a thread waits for.
 #[derive(Clone, Debug)]
 pub(crate) enum Wait {
-    /// Control steps left.
+    /// Number of control steps left.
     Steps(u32),
     Motion,
     Popup,
@@ -13,28 +13,28 @@ pub(crate) enum Wait {
     Socket(SocketWait),
 }
 
-/// Whether a call has a value now.
+/// Result of a call so far: its value, or what it waits for.
 #[derive(Clone, Debug)]
 pub(crate) enum Flow {
     Value(Value),
     Wait(Wait),
 }
 
-/// A blocking socket call under way.
+/// A blocking socket call.
 #[derive(Clone, Debug)]
 pub(crate) enum SocketWait {
     Connect { name: String, address: String, port: u16, steps: u32 },
     Read { name: String, what: Read, steps: Option<u32> },
 }
 
-/// What a read gives.
+/// What a read returns.
 #[derive(Clone, Debug)]
 pub(crate) enum Read {
     Integers(usize),
     Bytes(usize),
     Floats(usize),
     Line,
-    /// Everything that is there, or the text between two marks.
+    /// All received bytes, or the text between a prefix and a suffix.
     Any {
         prefix: String,
         suffix: String,
