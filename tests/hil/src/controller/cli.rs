@@ -16,7 +16,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// A mock Universal Robots controller: dashboard 29999, primary 30001, secondary 30002, real-time 30003, RTDE 30004.
+/// A mock Universal Robots controller: dashboard 29999, primary 30001, secondary 30002, real-time 30003, RTDE 30004, interpreter 30020.
 ///
 /// It runs uploaded URScript, moves a simulated arm and checks every set-point. When it is ready it prints one line of
 /// JSON.
@@ -198,6 +198,7 @@ fn announce(args: &Args, server: &Server) {
         "secondary": port(30002),
         "realtime": port(30003),
         "rtde": port(30004),
+        "interpreter": port(30020),
         "control": server.control_port(),
         "rate_hz": server.world.robot.setup.rate_hz,
         "pid": std::process::id(),

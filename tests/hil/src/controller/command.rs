@@ -18,6 +18,8 @@ pub enum Port {
     Secondary,
     /// 30003 and its read-only twin.
     Realtime,
+    /// 30020.
+    Interpreter,
     /// 30004.
     #[default]
     Rtde,
@@ -123,6 +125,19 @@ pub enum Command {
     DigitalIn { bits: u64 },
     /// Overwrites an output register, until a script writes it again.
     OutputInt { index: usize, value: i32 },
+    /// A plane that the TCP can touch: a point (m), the normal towards the free side, the stiffness (N/m).
+    ContactPlane {
+        point: [f64; 3],
+        normal: [f64; 3],
+        #[serde(default = "default_stiffness")]
+        stiffness: f64,
+    },
+    /// Wrench of the environment on the TCP, base frame, N and Nm.
+    ExternalWrench { wrench: [f64; 6] },
+    /// Value of a Modbus signal that a script has added.
+    ModbusSignal { name: String, value: i32 },
+    /// Register of the robot's Modbus server.
+    PortRegister { address: u16, value: u16 },
     /// Discards what scripts write to output registers.
     MuteOutputs { on: bool },
     /// `rtde_set_watchdog` is accepted without effect.
@@ -219,4 +234,9 @@ pub enum Command {
     },
     /// Ends all faults except safety stops.
     ClearFaults,
+}
+
+/// Stiffness of a contact plane, N/m.
+fn default_stiffness() -> f64 {
+    2000.0
 }

@@ -26,6 +26,8 @@ pub(super) enum Role {
     Realtime { scripts: Option<Collector> },
     /// RTDE.
     Rtde(Box<RtdeSession>),
+    /// Interpreter port: statements in, answers out. Holds the incomplete last line.
+    Interpreter(Vec<u8>),
     /// Control port: JSON lines. Holds the incomplete last line.
     Control(Vec<u8>),
 }
@@ -47,6 +49,8 @@ pub(super) struct Connection {
     pub(super) over: Option<&'static str>,
     /// Data packages skipped because the client did not keep up.
     pub(super) skipped: u64,
+    /// Time of the last read of a script port, ns.
+    pub(super) read_ns: u64,
     /// Data packages so far, for the fault that sends only one of many.
     pub(super) counted: u32,
 }
@@ -69,6 +73,7 @@ impl Connection {
             finishing: false,
             over: None,
             skipped: 0,
+            read_ns: 0,
             counted: 0,
         })
     }

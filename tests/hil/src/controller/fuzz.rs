@@ -238,7 +238,7 @@ fn the_dashboard_answers_any_line_with_one_line() {
 }
 
 /// Fragments from which programs are composed at random.
-const SCRIPT: [&str; 72] = [
+const SCRIPT: [&str; 77] = [
     "def f():",
     "end",
     "\n",
@@ -293,6 +293,11 @@ const SCRIPT: [&str; 72] = [
     "protective_stop()",
     "socket_close()",
     "tool_contact()",
+    "s = struct(a=1, b=x)",
+    "s.a",
+    "s.b[0] = 2",
+    "force_mode(p[0,0,0,0,0,0], [1,1,1,0,0,0], [x, n, 3], 2, [1,1,1,1,1,1])",
+    "interpreter_mode()",
     "make_list(3)",
     "to_num(\"1\")",
     "(",
@@ -359,7 +364,7 @@ fn script_ports_handle_any_bytes_however_they_are_split() {
         assert_eq!(found, pieces, "case {case}: {:?}", String::from_utf8_lossy(&bytes));
         for upload in found.unwrap_or_default() {
             match upload {
-                Upload::Program(text) => drop(robot.upload(&text)),
+                Upload::Program { text, first_line } => drop(robot.upload_at(&text, first_line)),
                 Upload::StopProgram => robot.stop_program(),
             }
         }
@@ -395,6 +400,39 @@ fn the_interpreter_handles_any_text() {
         }
     }
     assert!(ran > 0, "no text was a program");
+}
+
+#[test]
+fn interpreter_mode_handles_any_line() {
+    let mut d = Dice(6);
+    let mut robot = robot();
+    let mut accepted = 0u64;
+    for _ in 0..cases(30_000) {
+        if !robot.is_program_running() {
+            (robot.safety, robot.popup) = (SafetyMode::Normal, None);
+            robot.set_mode(RobotMode::Running);
+            robot.upload("interpreter_mode()\n");
+            robot.step();
+        }
+        let mut line = match d.below(4) {
+            0 => d
+                .pick(&["skipbuffer", "abort", "statelastexecuted", "clear_interpreter()", "end_interpreter()"])
+                .as_bytes()
+                .to_vec(),
+            _ => (0..1 + d.below(4)).map(|_| *d.pick(&SCRIPT)).collect::<Vec<_>>().join(" ").into_bytes(),
+        };
+        if d.one_in(3) {
+            d.mutate(&mut line);
+        }
+        let answer = robot.interpret(&String::from_utf8_lossy(&line));
+        accepted += u64::from(answer.starts_with("ack: "));
+        assert!(["ack: ", "state: ", "discard: "].iter().any(|a| answer.starts_with(a)), "{answer}");
+        if d.one_in(4) {
+            robot.step();
+            is_sane(&robot);
+        }
+    }
+    assert!(accepted > 0, "no line was accepted");
 }
 
 #[test]

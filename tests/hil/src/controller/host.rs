@@ -5,8 +5,8 @@ use super::registers::Registers;
 use super::robot::Robot;
 use crate::plant::{self, pose_to_vector, vector_to_pose};
 use crate::urscript::{
-    Bank, Connect, Host, HostError, JointVector, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup, PoseVector,
-    Received, RobotView, Target, Value, WatchdogAction,
+    Bank, Connect, ForceMode, Host, HostError, JointVector, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup,
+    PoseVector, Received, Remote, RobotView, Target, Value, WatchdogAction,
 };
 
 fn bit(kind: OutputKind, index: usize) -> u32 {
@@ -63,6 +63,7 @@ impl Host for Robot {
             tcp_pose_target: pose_to_vector(&self.generator.tool_pose()),
             tcp_speed_actual: r.actual_tcp_speed,
             tcp_speed_target: self.generator.tool_velocity(),
+            target_waypoint: self.target_waypoint(),
             tcp_force: r.tcp_force,
             tcp_offset: self.tcp,
             payload_mass: self.payload.mass,
@@ -104,6 +105,10 @@ impl Host for Robot {
 
     fn motion_start(&mut self, motion: &Motion) -> Result<(), HostError> {
         self.motion_failure = None;
+        let blend = match *motion {
+            Motion::MoveJ { r, .. } | Motion::MoveL { r, .. } | Motion::MoveP { r, .. } | Motion::MoveC { r, .. } => r,
+            _ => 0.0,
+        };
         let (command, time) = match *motion {
             Motion::MoveJ { target, a, v, t, .. } => {
                 (plant::Motion::MoveJ { q: self.joints_of(&target)?, accel: a, speed: v, duration: t }, None)
@@ -135,7 +140,7 @@ impl Host for Robot {
                 (plant::Motion::StopL { decel: a, rot_decel: given(a_rot).unwrap_or(a) }, None)
             }
         };
-        self.generator.start(command);
+        self.generator.start_blended(command, blend);
         self.motion_left_s = time;
         Ok(())
     }
@@ -239,6 +244,22 @@ impl Host for Robot {
             let voltage = self.signals.analog_types >> (2 + index) & 1 == 1;
             *out = if voltage { 10.0 * value } else { 0.004 + 0.016 * value };
         }
+    }
+
+    fn force_mode(&mut self, mode: &ForceMode) -> Result<(), HostError> {
+        self.begin_force_mode(mode)
+    }
+
+    fn end_force_mode(&mut self) {
+        self.generator.set_force_control(None);
+    }
+
+    fn rpc_begin(&mut self, url: &str, body: &str) -> Result<u32, HostError> {
+        self.remote_calls.begin(url, body).map_err(HostError::Refused)
+    }
+
+    fn rpc_poll(&mut self, call: u32) -> Remote {
+        self.remote_calls.poll(call)
     }
 
     fn call(&mut self, name: &str, arguments: &[Value]) -> Result<Value, HostError> {

@@ -53,7 +53,7 @@ impl Robot {
             target_tcp_pose: pose_to_vector(&(k.forward(&target_q) * tool)),
             actual_tcp_speed,
             target_tcp_speed: (k.jacobian(&target_q, &tool) * Vector6::from(target_qd)).into(),
-            tcp_force: self.external_wrench,
+            tcp_force: self.measured_wrench(),
             elbow_position: elbow.into(),
             elbow_velocity: ((elbow_next - elbow) * 1e6).into(),
             tool_acceleration: [acceleration[0], acceleration[1], acceleration[2] + 9.82],

@@ -9,7 +9,10 @@
 mod cli;
 mod command;
 mod connection;
+mod contact;
 mod dashboard;
+mod devices;
+mod force;
 #[cfg(test)]
 mod fuzz;
 mod host;
@@ -25,6 +28,7 @@ mod programs;
 mod questions;
 mod record;
 mod registers;
+mod remote_calls;
 mod report;
 mod robot;
 mod rtde_session;
@@ -38,6 +42,7 @@ mod world;
 
 pub use cli::{Args, main_with_args};
 pub use command::{Command, Port, WireAction};
+pub use contact::ContactPlane;
 pub use hosted::{Hosted, HostedError};
 pub use judge::{Episode, Judge, Limits, Rule, StepSample, Summary, Violation};
 pub use link_faults::{RtdeFaults, WireFaults};

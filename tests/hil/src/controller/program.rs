@@ -5,7 +5,7 @@ use super::programs::{MAX_SECONDARY, Upload};
 use super::robot::{PROGRAM_STOP_DECEL, Robot};
 use super::state::{RobotMode, RuntimeState};
 use crate::plant::Motion;
-use crate::urscript::{Machine, ProgramKind, StepOutcome, WatchdogAction};
+use crate::urscript::{Machine, ProgramKind, StepOutcome, WatchdogAction, no_program};
 
 impl Robot {
     /// Whether the main program is running: bit 1 of `robot_status_bits`.
@@ -16,7 +16,12 @@ impl Robot {
     /// Takes a script as ports 30001 to 30003 do: `def` replaces the main program, `sec` runs as a secondary program, a bare
     /// line is a program of one line.
     pub fn upload(&mut self, text: &str) -> Upload {
-        let machine = match Machine::load(text) {
+        self.upload_at(text, 1)
+    }
+
+    /// Like [`Robot::upload`] for a text that begins at line `first_line` of what the client sent.
+    pub fn upload_at(&mut self, text: &str, first_line: u32) -> Upload {
+        let machine = match Machine::load_at(text, first_line) {
             Ok(machine) => machine,
             Err(e) => {
                 self.say(MessageKind::Runtime { line: e.line as i32, column: 1, text: e.message.clone() });
@@ -42,6 +47,14 @@ impl Robot {
         (self.programs.main, self.programs.active) = (Some(machine), true);
         self.runtime = RuntimeState::Playing;
         Upload::Main
+    }
+
+    /// Answers one line of the interpreter port.
+    pub fn interpret(&mut self, line: &str) -> String {
+        let Some(mut main) = self.programs.main.take() else { return no_program(line) };
+        let answer = main.interpret(line, self);
+        self.programs.main = Some(main);
+        answer
     }
 
     /// Loads `NAME.urp`, i.e. `NAME.script` of the program directory; false if there is none.
@@ -99,6 +112,8 @@ impl Robot {
     pub(super) fn end_program(&mut self) {
         self.watchdogs.clear();
         self.sockets.close_all();
+        self.remote_calls.clear();
+        self.generator.set_force_control(None);
         (self.motion_left_s, self.motion_failure) = (None, None);
         self.programs.main = None;
         if std::mem::take(&mut self.programs.active) {

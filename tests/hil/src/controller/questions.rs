@@ -22,6 +22,9 @@ impl Robot {
     /// # Errors
     /// The name is unknown or an argument is invalid.
     pub(super) fn answer(&mut self, name: &str, a: &[Value]) -> Result<Value, HostError> {
+        if let Some(answer) = self.devices.answer(name, a) {
+            return answer;
+        }
         let bad = |what: &str| refused(format!("{name}: {what}"));
         Ok(match name {
             "get_actual_joint_positions_history" => {
@@ -69,6 +72,45 @@ impl Robot {
                 Value::None
             }
             "random" => Value::Float(self.memory.random()),
+            _ => return self.configure(name, a),
+        })
+    }
+
+    /// Executes a setting of a script.
+    ///
+    /// # Errors
+    /// The name is unknown or an argument is invalid.
+    fn configure(&mut self, name: &str, a: &[Value]) -> Result<Value, HostError> {
+        let bad = |what: &str| refused(format!("{name}: {what}"));
+        Ok(match name {
+            "zero_ftsensor" => {
+                self.zero_force_sensor();
+                Value::None
+            }
+            "force_mode_set_gain_scaling" => {
+                let scaling = a.first().and_then(Value::as_f64).filter(|s| (0.0..=2.0).contains(s));
+                self.generator.set_force_gain(scaling.ok_or_else(|| bad("the scaling must be from 0 to 2"))?);
+                Value::None
+            }
+            // The simulated contact is damped enough; the value is only checked.
+            "force_mode_set_damping" => {
+                let damping = a.first().and_then(Value::as_f64).filter(|d| (0.0..=1.0).contains(d));
+                damping.ok_or_else(|| bad("the damping must be from 0 to 1"))?;
+                Value::None
+            }
+            "set_tool_voltage" => {
+                let voltage = whole(a.first(), 25).filter(|v| [0, 12, 24].contains(v));
+                self.signals.tool_voltage = voltage.ok_or_else(|| bad("the voltage must be 0, 12 or 24"))? as i32;
+                Value::None
+            }
+            "get_standard_analog_out" | "get_analog_out" => {
+                let n = whole(a.first(), 2).ok_or_else(|| bad("outputs are numbered 0 and 1"))?;
+                Value::Float(self.signals.analog_out[n])
+            }
+            "powerdown" => {
+                self.power_off();
+                Value::None
+            }
             _ => return Err(HostError::UnknownFunction(name.to_owned())),
         })
     }

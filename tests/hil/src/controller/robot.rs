@@ -1,9 +1,12 @@
 //! The robot in memory: arm, safety, programs, registers. No servers and no clock: [`Robot::step`] is one control step.
 
+use super::contact::ContactPlane;
+use super::devices::Devices;
 use super::memory::Memory;
 use super::message::{MessageKind, Outbox};
 use super::programs::Programs;
 use super::registers::{Registers, Signals};
+use super::remote_calls::RemoteCalls;
 use super::report::{Report, ReportFault};
 use super::sockets::Sockets;
 use super::state::{RobotMode, RuntimeState, SafetyMode};
@@ -97,6 +100,10 @@ pub struct Robot {
     pub signals: Signals,
     /// `external_force_torque` input.
     pub external_wrench: [f64; 6],
+    /// A plane that the TCP can touch.
+    pub contact_plane: Option<ContactPlane>,
+    /// Wrench subtracted by `zero_ftsensor`.
+    pub(super) wrench_zero: [f64; 6],
     /// Speed slider, 0 to 1.
     pub slider: f64,
     /// Payload at the flange.
@@ -128,6 +135,8 @@ pub struct Robot {
     pub(super) motion_left_s: Option<f64>,
     pub(super) motion_failure: Option<String>,
     pub(super) sockets: Sockets,
+    pub(super) remote_calls: RemoteCalls,
+    pub(super) devices: Devices,
     pub(super) memory: Memory,
     pub(super) safety_since_s: f64,
     pub(super) transition: Option<(f64, RobotMode)>,
@@ -150,6 +159,8 @@ impl Robot {
             outputs: Registers::default(),
             signals: Signals::default(),
             external_wrench: [0.0; 6],
+            contact_plane: None,
+            wrench_zero: [0.0; 6],
             slider: 1.0,
             payload: Payload { mass: 0.0, cog: [0.0; 3], inertia: [0.0; 6] },
             tcp: [0.0; 6],
@@ -169,6 +180,8 @@ impl Robot {
             motion_left_s: None,
             motion_failure: None,
             sockets: Sockets::default(),
+            remote_calls: RemoteCalls::default(),
+            devices: Devices::default(),
             memory: Memory::default(),
             safety_since_s: f64::NEG_INFINITY,
             transition: None,
@@ -226,6 +239,7 @@ impl Robot {
             let paused = matches!(self.runtime, RuntimeState::Pausing | RuntimeState::Paused);
             let scaling = if paused { 0.0 } else { self.slider };
             self.generator.set_tool(crate::plant::vector_to_pose(&self.tcp));
+            self.generator.set_measured_wrench(self.measured_wrench());
             if let Err(cause) = self.generator.step(self.dt, scaling) {
                 self.stop_for(cause);
             }

@@ -19,7 +19,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const MAX_CONNECTIONS: usize = 128;
 /// Control steps run in one go after the host stalled; beyond them the time grid is shifted.
 const MAX_CATCH_UP_STEPS: u32 = 50;
-/// Longest line of the control port; it may hold a script.
+/// Pause between two reads after which the line numbers of a client's text begin again, ns.
+const SEND_GAP_NS: u64 = 100_000_000;
+/// Longest line of the control and the interpreter port; it may hold a script.
 const MAX_CONTROL_LINE_BYTES: usize = 1 << 20;
 /// Longest line of the dashboard.
 const MAX_DASHBOARD_LINE_BYTES: usize = 4096;
@@ -61,7 +63,7 @@ pub struct ListenError {
 }
 
 /// Ports of a controller; the last field is true for the read-only ones.
-const PORTS: [(u16, Port, bool); 8] = [
+const PORTS: [(u16, Port, bool); 9] = [
     (29999, Port::Dashboard, false),
     (30001, Port::Primary, false),
     (30002, Port::Secondary, false),
@@ -70,6 +72,7 @@ const PORTS: [(u16, Port, bool); 8] = [
     (30011, Port::Primary, true),
     (30012, Port::Secondary, true),
     (30013, Port::Realtime, true),
+    (30020, Port::Interpreter, false),
 ];
 
 impl Server {
@@ -183,7 +186,7 @@ impl Server {
                         }
                     }
                 }
-                Role::Dashboard(_) | Role::Control(_) => {}
+                Role::Dashboard(_) | Role::Interpreter(_) | Role::Control(_) => {}
             }
             c.flush(&wire, now);
         }
@@ -250,6 +253,7 @@ impl Server {
                 Port::Primary | Port::Secondary => Role::State { scripts: scripts() },
                 Port::Realtime => Role::Realtime { scripts: scripts() },
                 Port::Rtde => Role::Rtde(Box::new(RtdeSession::new(id))),
+                Port::Interpreter => Role::Interpreter(Vec::new()),
                 Port::Control => Role::Control(Vec::new()),
             };
             let Ok(mut c) = Connection::new(id, port, role, stream) else { continue };
@@ -262,7 +266,7 @@ impl Server {
                     c.send(&primary::robot_state(&self.world.robot, true), &wire, now, random);
                 }
                 Port::Rtde => self.world.judge.forget_client(),
-                Port::Realtime | Port::Control => {}
+                Port::Realtime | Port::Interpreter | Port::Control => {}
             }
             self.world.note(now, &format!("connection {id} {port:?} from {peer}"));
             self.connections.push(c);
@@ -307,6 +311,21 @@ fn log(text: &str) {
     let _ = std::io::Write::write_fmt(&mut std::io::stderr(), format_args!("graspd-mock-ur: {text}\n"));
 }
 
+/// Starts an uploaded program, or stops the running one.
+fn run_upload(upload: Upload, world: &mut World, now: u64) {
+    match upload {
+        Upload::Program { text, first_line } => {
+            if let super::programs::Upload::Refused(reason) = world.upload(now, &text, first_line) {
+                log(&format!("script refused: {reason}"));
+            }
+        }
+        Upload::StopProgram => {
+            world.note(now, "stop program");
+            world.robot.stop_program();
+        }
+    }
+}
+
 /// Reads from a connection and handles what was read.
 fn receive(c: &mut Connection, world: &mut World, buffer: &mut [u8], now: u64) {
     let Some(bytes) = c.read(buffer).map(<[u8]>::to_vec) else { return };
@@ -328,6 +347,15 @@ fn receive(c: &mut Connection, world: &mut World, buffer: &mut [u8], now: u64) {
             }
             Err(()) => c.over = Some("sent an overlong line"),
         },
+        Role::Interpreter(rest) => match lines(rest, &bytes, MAX_CONTROL_LINE_BYTES) {
+            Ok(found) => {
+                for line in found.iter().filter(|l| !l.trim().is_empty()) {
+                    answer.extend_from_slice(world.robot.interpret(line).replace(['\n', '\r'], " ").as_bytes());
+                    answer.push(b'\n');
+                }
+            }
+            Err(()) => c.over = Some("sent an overlong line"),
+        },
         Role::Control(rest) => match lines(rest, &bytes, MAX_CONTROL_LINE_BYTES) {
             Ok(found) => {
                 for line in found {
@@ -344,24 +372,16 @@ fn receive(c: &mut Connection, world: &mut World, buffer: &mut [u8], now: u64) {
             }
             Err(()) => c.over = Some("sent an overlong line"),
         },
-        Role::State { scripts: Some(stream) } | Role::Realtime { scripts: Some(stream) } => match stream.push(&bytes) {
-            Ok(uploads) => {
-                for upload in uploads {
-                    match upload {
-                        Upload::Program(text) => {
-                            if let super::programs::Upload::Refused(reason) = world.upload(now, &text) {
-                                log(&format!("script refused: {reason}"));
-                            }
-                        }
-                        Upload::StopProgram => {
-                            world.note(now, "stop program");
-                            world.robot.stop_program();
-                        }
-                    }
-                }
+        Role::State { scripts: Some(stream) } | Role::Realtime { scripts: Some(stream) } => {
+            if now.saturating_sub(c.read_ns) > SEND_GAP_NS {
+                stream.begin_send();
             }
-            Err(reason) => c.over = Some(reason),
-        },
+            c.read_ns = now;
+            match stream.push(&bytes) {
+                Ok(uploads) => uploads.into_iter().for_each(|upload| run_upload(upload, world, now)),
+                Err(reason) => c.over = Some(reason),
+            }
+        }
         // Read-only ports ignore input.
         Role::State { scripts: None } | Role::Realtime { scripts: None } => {}
         Role::Rtde(session) => {

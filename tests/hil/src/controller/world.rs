@@ -1,6 +1,7 @@
 //! Robot, judge, wire record and active faults: everything behind the sockets.
 
 use super::command::{Command, Port, WireAction};
+use super::contact::ContactPlane;
 use super::judge::{Judge, Limits, StepSample};
 use super::link_faults::{RtdeFaults, WireFaults, later};
 use super::programs::Upload;
@@ -93,8 +94,8 @@ impl World {
     }
 
     /// Uploads a script and records the outcome.
-    pub fn upload(&mut self, now_ns: u64, text: &str) -> Upload {
-        let outcome = self.robot.upload(text);
+    pub fn upload(&mut self, now_ns: u64, text: &str, first_line: u32) -> Upload {
+        let outcome = self.robot.upload_at(text, first_line);
         let first = text.lines().find(|l| !l.trim().is_empty()).unwrap_or("");
         self.note(now_ns, &format!("script {outcome:?}: {first}"));
         outcome
@@ -175,7 +176,7 @@ impl World {
             Command::PauseProgram => drop(robot.pause_program()),
             Command::PlayProgram => robot.play().then_some(()).ok_or("no program is loaded or paused")?,
             Command::StopProgram => robot.stop_program(),
-            Command::Script { text } => self.upload(now_ns, &text).accepted()?,
+            Command::Script { text } => self.upload(now_ns, &text, 1).accepted()?,
             Command::NanPosition { joint } => robot.report_fault.nan_position = Some(joint),
             Command::NanSpeed { joint } => robot.report_fault.nan_speed = Some(joint),
             Command::Jump { joint, rad, seconds } => self.jump(joint, rad, seconds)?,
@@ -191,6 +192,12 @@ impl World {
             Command::OutputInt { index, value } => {
                 *robot.outputs.ints.get_mut(index).ok_or("registers are numbered 0 to 47")? = value;
             }
+            Command::ContactPlane { point, normal, stiffness } => {
+                robot.contact_plane = Some(ContactPlane::new(point, normal, stiffness)?);
+            }
+            Command::ExternalWrench { wrench } => robot.external_wrench = wrench,
+            Command::ModbusSignal { name, value } => robot.devices.set_signal(&name, value)?,
+            Command::PortRegister { address, value } => robot.devices.set_port_register(address, value),
             Command::MuteOutputs { on } => robot.mute_outputs = on,
             Command::NoWatchdog { on } => robot.deaf_watchdog = on,
             Command::ClockRestart => robot.shift_clock(None),
@@ -244,7 +251,7 @@ impl World {
         robot.report_fault = ReportFault::default();
         robot.set_drive_fault(|f| *f = DriveFault::default());
         (robot.deaf_watchdog, robot.mute_outputs, robot.claimed_robot_type) = (false, false, None);
-        robot.external_wrench = [0.0; 6];
+        (robot.external_wrench, robot.contact_plane) = ([0.0; 6], None);
         self.rtde_faults = RtdeFaults::default();
         self.wire_faults.clear();
     }

@@ -1,5 +1,7 @@
 //! The motion generator: motion commands in, joint targets out, one control step at a time.
 
+use super::compliance::Compliance;
+use super::leg::{Leg, Shape};
 use super::motion::{MAX_TARGET_ACCEL, Motion, REDUCED_SPEED_FRACTION, SAFETY_DECEL, StopCause};
 use super::path::CartesianPath;
 use super::profile::Profile;
@@ -8,19 +10,22 @@ use nalgebra::{Isometry3, Vector3, Vector6};
 
 /// The motion under way.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "one value per arm, copied once a step; a box would allocate in the step"
+)]
 pub(super) enum Active {
     Rest,
     Follow(Motion),
     /// Decelerating to rest (rad/s^2 of the leading joint), then an optional move.
     Brake(f64, Option<Motion>),
-    Joint {
-        from: Joints,
-        to: Joints,
-        profile: Profile,
-    },
-    Tool {
-        path: CartesianPath,
-        profile: Profile,
+    /// A move.
+    Path(Leg),
+    /// The end of a move and the beginning of the next one: their displacements from `corner`, the end of the first, add up.
+    Blend {
+        tail: Leg,
+        lead: Leg,
+        corner: Joints,
     },
 }
 
@@ -40,6 +45,11 @@ pub struct Generator {
     pub(super) reduced: bool,
     pub(super) kinematics: Kinematics,
     pub(super) tool: Isometry3<f64>,
+    pub(super) compliance: Compliance,
+    /// Tool pose at the end of the present or the last move, base frame.
+    waypoint: Option<Isometry3<f64>>,
+    /// Blend radius of the move that is planned next, m.
+    next_blend_m: f64,
 }
 
 impl Generator {
@@ -56,6 +66,9 @@ impl Generator {
             reduced: false,
             kinematics,
             tool: Isometry3::identity(),
+            compliance: Compliance::default(),
+            waypoint: None,
+            next_blend_m: 0.0,
         }
     }
 
@@ -91,6 +104,19 @@ impl Generator {
 
     /// Starts a motion, replacing the present one. A move begins once the arm is at rest.
     pub fn start(&mut self, motion: Motion) {
+        self.start_blended(motion, 0.0);
+    }
+
+    /// Starts a motion. Within `blend_m` of its end a move counts as settled, and the next move begins without a stop.
+    pub fn start_blended(&mut self, motion: Motion, blend_m: f64) {
+        if let Some(waypoint) = self.target(&motion) {
+            self.waypoint = Some(waypoint);
+            if let Some(blend) = self.blend(motion, blend_m) {
+                self.active = blend;
+                return;
+            }
+        }
+        self.next_blend_m = blend_m;
         self.active = match motion {
             Motion::SpeedJ { .. } | Motion::SpeedL { .. } | Motion::Servo { .. } | Motion::StopL { .. } => {
                 Active::Follow(motion)
@@ -101,19 +127,46 @@ impl Generator {
         };
     }
 
+    /// Tool pose at the end of a move.
+    fn target(&self, motion: &Motion) -> Option<Isometry3<f64>> {
+        match motion {
+            Motion::MoveJ { q, .. } => Some(self.kinematics.forward(q) * self.tool),
+            Motion::MoveL { pose, .. } | Motion::MoveC { pose, .. } => Some(vector_to_pose(pose)),
+            _ => None,
+        }
+    }
+
+    /// The blend of the present move with the next one, if the present move has a blend radius and has not ended.
+    fn blend(&self, next: Motion, blend_m: f64) -> Option<Active> {
+        let Active::Path(tail) = self.active else { return None };
+        if tail.blend_m <= 0.0 || tail.profile.is_done() {
+            return None;
+        }
+        let corner = tail.last(&self.kinematics, &self.tool)?;
+        let lead = self.leg(next, corner, blend_m)?;
+        Some(Active::Blend { tail, lead, corner })
+    }
+
+    /// Tool pose at the end of the present or the last move; the present one before the first move.
+    pub fn waypoint(&self) -> Isometry3<f64> {
+        self.waypoint.unwrap_or_else(|| self.tool_pose())
+    }
+
     /// Stops the joints with the deceleration of the safety system.
     pub fn safety_stop(&mut self) {
         self.active = Active::Brake(SAFETY_DECEL, None);
+        self.compliance.cancel();
     }
 
     /// Sets the targets to joint positions, at rest: after power on or brake release.
     pub fn snap(&mut self, q: Joints) {
         (self.q, self.qd, self.qdd, self.active) = (q, [0.0; 6], [0.0; 6], Active::Rest);
+        self.compliance.cancel();
     }
 
     /// Stops a move before its end; speed and servo motions continue.
     pub fn abandon_move(&mut self) {
-        if matches!(self.active, Active::Joint { .. } | Active::Tool { .. } | Active::Brake(_, Some(_))) {
+        if matches!(self.active, Active::Path(_) | Active::Blend { .. } | Active::Brake(_, Some(_))) {
             self.active = Active::Brake(4.0, None);
         }
     }
@@ -123,7 +176,10 @@ impl Generator {
         match &self.active {
             Active::Rest => true,
             Active::Brake(..) => false,
-            Active::Joint { profile, .. } | Active::Tool { profile, .. } => profile.is_done(),
+            Active::Path(leg) => {
+                leg.profile.is_done() || self.tool_pose().translation.vector.metric_distance(&leg.end) < leg.blend_m
+            }
+            Active::Blend { .. } => false,
             Active::Follow(Motion::SpeedJ { qd, .. }) => {
                 (0..6).all(|i| (self.qd[i] - qd[i] * self.scaling).abs() < 1e-9)
             }
@@ -147,7 +203,7 @@ impl Generator {
     /// Completed fraction of the move, 0 to 1; 1 if no move is under way.
     pub fn progress(&self) -> f64 {
         match &self.active {
-            Active::Joint { profile, .. } | Active::Tool { profile, .. } => profile.fraction(),
+            Active::Path(leg) | Active::Blend { lead: leg, .. } => leg.profile.fraction(),
             Active::Brake(_, Some(_)) => 0.0,
             _ => 1.0,
         }
@@ -164,7 +220,10 @@ impl Generator {
         let slew = SCALING_SLEW_PER_S * dt;
         self.scaling += (requested_scaling.clamp(0.0, 1.0) - self.scaling).clamp(-slew, slew);
         let (q, qd) = (self.q, self.qd);
+        self.remove_compliance();
         let result = self.advance(dt);
+        let on_path = matches!(self.active, Active::Path(_) | Active::Blend { .. });
+        self.add_compliance(on_path, dt);
         if result.is_err() {
             (self.q, self.qd) = (q, qd);
             self.safety_stop();
@@ -174,6 +233,7 @@ impl Generator {
         if matches!(result, Err(StopCause::JointSpeed { .. })) {
             // A target beyond the limit must not reach the drives: the stop begins from the previous target.
             (self.q, self.qd) = (q, qd);
+            self.compliance.cancel();
             self.brake(SAFETY_DECEL, dt);
         }
         self.qdd = std::array::from_fn(|i| (self.qd[i] - qd[i]) / dt);
@@ -192,21 +252,26 @@ impl Generator {
                 }
             }
             Active::Follow(motion) => self.follow(motion, dt)?,
-            Active::Joint { from, to, mut profile } => {
-                let was = profile.fraction();
-                profile.advance(dt * self.path_scaling());
-                let now = profile.fraction();
-                self.active = if profile.is_done() { Active::Rest } else { Active::Joint { from, to, profile } };
-                self.q = std::array::from_fn(|i| from[i] + (to[i] - from[i]) * now);
-                self.qd = std::array::from_fn(|i| (to[i] - from[i]) * (now - was) / dt);
-            }
-            Active::Tool { path, mut profile } => {
-                profile.advance(dt * self.path_scaling());
-                let goal = path.at(profile.fraction()) * self.tool.inverse();
-                let q = self.kinematics.inverse(&goal, &self.q).ok_or(StopCause::Unreachable)?;
+            Active::Path(mut leg) => {
+                let q = leg
+                    .advance(dt * self.path_scaling(), &self.kinematics, &self.tool)
+                    .ok_or(StopCause::Unreachable)?;
                 self.qd = std::array::from_fn(|i| (q[i] - self.q[i]) / dt);
                 self.q = q;
-                self.active = if profile.is_done() { Active::Rest } else { Active::Tool { path, profile } };
+                self.active = if leg.profile.is_done() { Active::Rest } else { Active::Path(leg) };
+            }
+            Active::Blend { mut tail, mut lead, corner } => {
+                let path_dt = dt * self.path_scaling();
+                let advance = |leg: &mut Leg| leg.advance(path_dt, &self.kinematics, &self.tool);
+                let (a, b) = advance(&mut tail).zip(advance(&mut lead)).ok_or(StopCause::Unreachable)?;
+                let q: Joints = std::array::from_fn(|i| a[i] + b[i] - corner[i]);
+                self.qd = std::array::from_fn(|i| (q[i] - self.q[i]) / dt);
+                self.q = q;
+                self.active = match (tail.profile.is_done(), lead.profile.is_done()) {
+                    (true, true) => Active::Rest,
+                    (true, false) => Active::Path(lead),
+                    _ => Active::Blend { tail, lead, corner },
+                };
             }
         }
         Ok(())
@@ -218,27 +283,37 @@ impl Generator {
 
     /// Plans a move from the present position, where the arm is at rest.
     fn plan(&self, motion: Motion) -> Active {
-        match motion {
+        self.leg(motion, self.q, self.next_blend_m).map_or(Active::Rest, Active::Path)
+    }
+
+    /// Plans a move that begins at `start`; `None` for other motions.
+    fn leg(&self, motion: Motion, start: Joints, blend_m: f64) -> Option<Leg> {
+        let from = self.kinematics.forward(&start) * self.tool;
+        let (shape, profile) = match motion {
             Motion::MoveJ { q, accel, speed, duration } => {
-                let far = (0..6).map(|i| (q[i] - self.q[i]).abs()).fold(0.0, f64::max);
+                let far = (0..6).map(|i| (q[i] - start[i]).abs()).fold(0.0, f64::max);
                 // Joints have different speed limits: the move is slowed down until no joint exceeds its own.
                 let allowed = (0..6)
-                    .map(|i| self.max_speed[i] * far / (q[i] - self.q[i]).abs().max(1e-12))
+                    .map(|i| self.max_speed[i] * far / (q[i] - start[i]).abs().max(1e-12))
                     .fold(speed.abs(), f64::min);
                 let accel = accel.abs().min(MAX_TARGET_ACCEL);
-                Active::Joint { from: self.q, to: q, profile: Profile::new(far, allowed, accel, duration) }
+                (Shape::Joint { from: start, to: q }, Profile::new(far, allowed, accel, duration))
             }
             Motion::MoveL { pose, accel, speed, duration } => {
-                let path = CartesianPath::Line { from: self.tool_pose(), to: vector_to_pose(&pose) };
-                Active::Tool { path, profile: Profile::new(path.length(), speed, accel, duration) }
+                let path = CartesianPath::Line { from, to: vector_to_pose(&pose) };
+                (Shape::Tool(path), Profile::new(path.length(), speed, accel, duration))
             }
             Motion::MoveC { via, pose, accel, speed } => {
                 let via = Vector3::new(via[0], via[1], via[2]);
-                let path = CartesianPath::arc(self.tool_pose(), via, vector_to_pose(&pose));
-                Active::Tool { path, profile: Profile::new(path.length(), speed, accel, 0.0) }
+                let path = CartesianPath::arc(from, via, vector_to_pose(&pose));
+                (Shape::Tool(path), Profile::new(path.length(), speed, accel, 0.0))
             }
-            _ => Active::Rest,
-        }
+            _ => return None,
+        };
+        let end = self.target(&motion)?.translation.vector;
+        // A blend radius above half the length would begin the next move before this one has got under way.
+        let blend_m = blend_m.max(0.0).min(0.5 * end.metric_distance(&from.translation.vector));
+        Some(Leg { shape, profile, q: start, end, blend_m })
     }
 
     /// Tool pose of the targets.

@@ -4,16 +4,20 @@
 //! part ([`Drives`]) follows the targets with lag, limited acceleration and quantised encoders. Nothing reads a clock or a
 //! socket: `dt` is an argument.
 
+mod compliance;
 mod drives;
+mod force_control;
 mod generator;
 mod gravity;
 mod kinematics;
+mod leg;
 mod model;
 mod motion;
 mod path;
 mod profile;
 mod tracking;
 
+pub use compliance::ForceControl;
 pub use drives::{DriveFault, Drives};
 pub use generator::Generator;
 pub use gravity::gravity_torques;

@@ -8,6 +8,8 @@ pub(crate) const MAX_WEIGHT: usize = 20_000;
 /// Nesting depth of lists; a matrix has 2.
 pub(crate) const MAX_LIST_DEPTH: usize = 4;
 
+/// Longest string of a script.
+pub(crate) const MAX_TEXT_BYTES: usize = 16_384;
 /// Rows or columns of a matrix operand: far above a Jacobian, and cheap enough for one instruction.
 pub(crate) const MAX_MATRIX: usize = 60;
 
@@ -96,8 +98,21 @@ fn calculate(op: BinaryOp, a: &Value, b: &Value) -> Outcome {
         (Value::Int(_) | Value::Float(_), Value::List(y)) => {
             y.iter().map(|y| calculate(op, a, y)).collect::<Result<_, _>>().map(Value::List)
         }
+        (Value::Str(x), Value::Str(y)) if op == BinaryOp::Add => concatenate(x, y),
+        (Value::Str(_), _) | (_, Value::Str(_)) if op == BinaryOp::Add => Err(format!(
+            "'+' needs two strings or two numbers, got {} and {}; convert with to_str",
+            a.type_name(),
+            b.type_name()
+        )),
         _ => Err(format!("cannot calculate with {} and {}", a.type_name(), b.type_name())),
     }
+}
+
+fn concatenate(x: &str, y: &str) -> Outcome {
+    if x.len() + y.len() > MAX_TEXT_BYTES {
+        return Err(format!("a string of more than {MAX_TEXT_BYTES} bytes"));
+    }
+    Ok(Value::Str(format!("{x}{y}")))
 }
 
 /// `+ - *` and `%` of integers are integers; `/` gives a real number, on which UR's own driver scripts rely.
@@ -182,6 +197,9 @@ pub(crate) fn whole(v: &Value) -> Option<i64> {
 }
 
 fn position(v: &Value, length: usize) -> Outcome<usize> {
+    if let Value::Str(name) = v {
+        return Err(format!("only a struct has members such as '{name}'"));
+    }
     let i = whole(v).ok_or_else(|| format!("an index must be an integer, got {} ({v})", v.type_name()))?;
     usize::try_from(i)
         .ok()
@@ -189,7 +207,16 @@ fn position(v: &Value, length: usize) -> Outcome<usize> {
         .ok_or_else(|| format!("index {i} is out of range: {length} elements, the first one is 0"))
 }
 
-/// `base[path...]`.
+/// Position of a struct's member.
+fn member(members: &[(String, Value)], name: &Value) -> Outcome<usize> {
+    let Value::Str(name) = name else { return Err("a struct has members, not elements".to_owned()) };
+    members.iter().position(|(n, _)| n == name).ok_or_else(|| {
+        let names: Vec<&str> = members.iter().map(|(n, _)| n.as_str()).collect();
+        format!("the struct has no member '{name}', only {}", names.join(", "))
+    })
+}
+
+/// `base[path...]`; a string in the path names a member of a struct.
 pub(crate) fn element(base: &Value, path: &[Value]) -> Outcome {
     let Some((first, rest)) = path.split_first() else { return Ok(base.clone()) };
     match base {
@@ -200,6 +227,10 @@ pub(crate) fn element(base: &Value, path: &[Value]) -> Outcome {
         Value::Pose(p) if rest.is_empty() => {
             let i = position(first, 6)?;
             Ok(Value::Float(p.get(i).copied().unwrap_or(0.0)))
+        }
+        Value::Struct(members) => {
+            let i = member(members, first)?;
+            members.get(i).map_or_else(|| Err("no such member".to_owned()), |(_, v)| element(v, rest))
         }
         other => Err(format!("{} has no elements", other.type_name())),
     }
@@ -215,6 +246,10 @@ pub(crate) fn set_element(base: &mut Value, path: &[Value], value: Value) -> Out
         Value::List(items) => {
             let i = position(first, items.len())?;
             items.get_mut(i).map_or_else(|| Err("index out of range".to_owned()), |v| set_element(v, rest, value))
+        }
+        Value::Struct(members) => {
+            let i = member(members, first)?;
+            members.get_mut(i).map_or_else(|| Err("no such member".to_owned()), |(_, v)| set_element(v, rest, value))
         }
         Value::Pose(p) if rest.is_empty() => {
             let i = position(first, 6)?;

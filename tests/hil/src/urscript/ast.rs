@@ -39,13 +39,15 @@ pub(crate) enum ExprKind {
     Name(String),
     List(Vec<Expr>),
     Pose(Vec<Expr>),
-    /// `a[i][j, k]` flattened to one path.
+    /// `a[i][j, k].member` flattened to one path; a member is a string literal.
     Index(Box<Expr>, Vec<Expr>),
     Unary(UnaryOp, Box<Expr>),
     Binary(BinaryOp, Box<Expr>, Box<Expr>),
     And(Box<Expr>, Box<Expr>),
     Or(Box<Expr>, Box<Expr>),
     Call(String, Vec<Argument>),
+    /// `base.name(arguments)`: a remote procedure call.
+    Method(Box<Expr>, String, Vec<Argument>),
     Run(String),
 }
 

@@ -2,47 +2,20 @@
 
 use super::arithmetic::Outcome;
 use super::error::HostError;
-use super::host::{Bank, Host, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup, Target, WatchdogAction};
+use super::functions::{Support, bind, support};
+use super::host::{
+    Bank, ForceMode, Host, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup, Target, WatchdogAction,
+};
 use super::pure::{boolean, finite, index, int32, number, pose, six, text};
-use super::signature::bind;
 use super::sockets::SocketBuffers;
 use super::value::Value;
 use super::wait::{Flow, Wait};
-use super::{pure, sockets};
+use super::{pure, rpc, sockets};
 
 /// Integer and float registers of either bank.
 const REGISTERS: usize = 48;
 /// Boolean registers of either bank.
 const BITS: usize = 128;
-
-/// Settings that are passed to the host and have no meaning in the interpreter.
-const SETTINGS: [&str; 25] = [
-    "force_mode",
-    "end_force_mode",
-    "force_mode_set_damping",
-    "force_mode_set_gain_scaling",
-    "zero_ftsensor",
-    "freedrive_mode",
-    "end_freedrive_mode",
-    "teach_mode",
-    "end_teach_mode",
-    "set_gravity",
-    "set_payload_cog",
-    "set_target_payload",
-    "enable_external_ft_sensor",
-    "ft_rtde_input_enable",
-    "set_tool_voltage",
-    "set_tool_communication",
-    "set_tool_output_mode",
-    "set_tool_digital_output_mode",
-    "set_standard_analog_input_domain",
-    "set_analog_outputdomain",
-    "set_tool_analog_input_domain",
-    "set_safety_mode_transition_hardness",
-    "conveyor_pulse_decode",
-    "set_conveyor_tick_count",
-    "reset_revolution_counter",
-];
 
 fn refused(e: HostError) -> String {
     e.to_string()
@@ -60,14 +33,14 @@ pub(crate) fn begin(
     if given.contains(&Value::None) {
         return Err(format!("an argument of '{name}' has no value"));
     }
-    if SETTINGS.contains(&name) {
-        host.setting(name, &given).map_err(refused)?;
-        return Ok(Flow::Value(Value::None));
-    }
-    let Some(bound) = bind(name, given.clone(), names) else {
-        return host.call(name, &given).map(Flow::Value).map_err(refused);
+    let Some(bound) = bind(name, given, names) else {
+        return Err(HostError::UnknownFunction(name.to_owned()).to_string());
     };
     let a = bound?;
+    if support(name) == Support::WithoutEffect {
+        host.setting(name, &a).map_err(refused)?;
+        return Ok(Flow::Value(Value::None));
+    }
     if let Some(value) = pure::call(name, &a) {
         return value.map(Flow::Value);
     }
@@ -104,6 +77,7 @@ pub(crate) fn begin(
             host.popup(&popup);
             Ok(if popup.blocking { Flow::Wait(Wait::Popup) } else { Flow::Value(Value::None) })
         }
+        "rpc_factory" => rpc::factory(text(x)?, text(a.get(1).unwrap_or(&none))?).map(Flow::Value),
         _ => immediate(name, &a, host).map(Flow::Value),
     }
 }
@@ -119,7 +93,8 @@ pub(crate) fn resume(wait: Wait, host: &mut dyn Host, buffers: &mut SocketBuffer
         },
         Wait::Popup if host.popup_open() => Ok(Flow::Wait(Wait::Popup)),
         Wait::Socket(wait) => sockets::resume(wait, host, buffers),
-        Wait::Steps(_) | Wait::Popup | Wait::Thread(_) => Ok(Flow::Value(Value::None)),
+        Wait::Remote(call) => rpc::resume(call, host),
+        Wait::Steps(_) | Wait::Popup | Wait::Thread(_) | Wait::Interpreter => Ok(Flow::Value(Value::None)),
     }
 }
 
@@ -178,11 +153,41 @@ fn query(a: &[Value]) -> Outcome<KinematicsQuery> {
     })
 }
 
+/// Value of a function that returns a part of the arm's state; `None` if `name` is not one.
+fn state(name: &str, host: &dyn Host) -> Option<Value> {
+    Some(match name {
+        "get_actual_tcp_pose" => Value::Pose(host.view().tcp_pose_actual),
+        "get_target_tcp_pose" | "get_target_tcp_pose_along_path" => Value::Pose(host.view().tcp_pose_target),
+        "get_target_waypoint" => Value::Pose(host.view().target_waypoint),
+        "get_actual_tool_flange_pose" => Value::Pose(host.forward_kinematics(&host.view().q_actual, Some(&[0.0; 6]))),
+        "get_actual_tcp_speed" => Value::Pose(host.view().tcp_speed_actual),
+        "get_target_tcp_speed" | "get_target_tcp_speed_along_path" => Value::Pose(host.view().tcp_speed_target),
+        "get_actual_joint_positions" | "get_joint_positions" => Value::floats(&host.view().q_actual),
+        "get_target_joint_positions" => Value::floats(&host.view().q_target),
+        "get_actual_joint_speeds" => Value::floats(&host.view().qd_actual),
+        "get_target_joint_speeds" => Value::floats(&host.view().qd_target),
+        "get_joint_torques" => Value::floats(&host.view().torques),
+        "get_tcp_force" => Value::Pose(host.view().tcp_force),
+        "force" => {
+            let f = host.view().tcp_force;
+            Value::Float(f.iter().take(3).map(|x| x * x).sum::<f64>().sqrt())
+        }
+        "get_tcp_offset" => Value::Pose(host.view().tcp_offset),
+        "get_target_payload" => Value::Float(host.view().payload_mass),
+        "get_target_payload_cog" => Value::floats(&host.view().payload_cog),
+        "is_steady" => Value::Bool(host.view().steady),
+        _ => return None,
+    })
+}
+
 fn immediate(name: &str, a: &[Value], host: &mut dyn Host) -> Outcome {
     let none = Value::None;
     let [x, y, z] = [0, 1, 2].map(|i| a.get(i).unwrap_or(&none));
     if let Some(done) = register(name, x, y, host).or_else(|| signal(name, x, y, host)) {
         return done;
+    }
+    if let Some(value) = state(name, host) {
+        return Ok(value);
     }
     let joints = |host: &dyn Host| -> Outcome<[f64; 6]> { Ok(optional_six(x)?.unwrap_or(host.view().q_actual)) };
     Ok(match name {
@@ -201,25 +206,6 @@ fn immediate(name: &str, a: &[Value], host: &mut dyn Host) -> Outcome {
             let rows = host.jacobian(&q, optional_six(y)?.as_ref());
             Value::List(rows.iter().map(|r| Value::floats(r)).collect())
         }
-        "get_actual_tcp_pose" => Value::Pose(host.view().tcp_pose_actual),
-        "get_target_tcp_pose" => Value::Pose(host.view().tcp_pose_target),
-        "get_actual_tool_flange_pose" => Value::Pose(host.forward_kinematics(&host.view().q_actual, Some(&[0.0; 6]))),
-        "get_actual_tcp_speed" => Value::Pose(host.view().tcp_speed_actual),
-        "get_target_tcp_speed" => Value::Pose(host.view().tcp_speed_target),
-        "get_actual_joint_positions" | "get_joint_positions" => Value::floats(&host.view().q_actual),
-        "get_target_joint_positions" => Value::floats(&host.view().q_target),
-        "get_actual_joint_speeds" => Value::floats(&host.view().qd_actual),
-        "get_target_joint_speeds" => Value::floats(&host.view().qd_target),
-        "get_joint_torques" => Value::floats(&host.view().torques),
-        "get_tcp_force" => Value::Pose(host.view().tcp_force),
-        "force" => {
-            let f = host.view().tcp_force;
-            Value::Float(f.iter().take(3).map(|x| x * x).sum::<f64>().sqrt())
-        }
-        "get_tcp_offset" => Value::Pose(host.view().tcp_offset),
-        "get_target_payload" => Value::Float(host.view().payload_mass),
-        "get_target_payload_cog" => Value::floats(&host.view().payload_cog),
-        "is_steady" => Value::Bool(host.view().steady),
         "textmsg" => {
             host.text_message(&format!("{x}{y}"));
             Value::None
@@ -235,6 +221,24 @@ fn immediate(name: &str, a: &[Value], host: &mut dyn Host) -> Outcome {
         }
         "set_payload_mass" => {
             host.set_payload(finite(x)?, None).map_err(refused)?;
+            Value::None
+        }
+        "set_payload_cog" => {
+            let mass = host.view().payload_mass;
+            host.set_payload(mass, Some(three(x)?)).map_err(refused)?;
+            Value::None
+        }
+        "set_target_payload" => {
+            let cog = if *y == Value::None { None } else { Some(three(y)?) };
+            host.set_payload(finite(x)?, cog).map_err(refused)?;
+            Value::None
+        }
+        "force_mode" => {
+            host.force_mode(&force_mode(a)?).map_err(refused)?;
+            Value::None
+        }
+        "end_force_mode" => {
+            host.end_force_mode();
             Value::None
         }
         "protective_stop" => {
@@ -256,6 +260,23 @@ fn immediate(name: &str, a: &[Value], host: &mut dyn Host) -> Outcome {
     })
 }
 
+fn force_mode(a: &[Value]) -> Outcome<ForceMode> {
+    let none = Value::None;
+    let at = |i: usize| a.get(i).unwrap_or(&none);
+    let selection = six(at(1)).map_err(|e| format!("force_mode: selection_vector: {e}"))?;
+    let frame_type = int32(at(3))?;
+    if !(1..=3).contains(&frame_type) {
+        return Err(format!("force_mode: type {frame_type} is not 1, 2 or 3"));
+    }
+    Ok(ForceMode {
+        task_frame: pose(at(0)).map_err(|e| format!("force_mode: task_frame: {e}"))?,
+        compliant: selection.map(|s| s != 0.0),
+        wrench: six(at(2)).map_err(|e| format!("force_mode: wrench: {e}"))?,
+        frame_type,
+        limits: six(at(4)).map_err(|e| format!("force_mode: limits: {e}"))?,
+    })
+}
+
 fn three(v: &Value) -> Outcome<[f64; 3]> {
     match v {
         Value::List(items) => match items.as_slice() {
@@ -270,7 +291,7 @@ fn register(name: &str, x: &Value, y: &Value, host: &mut dyn Host) -> Option<Out
     let bank = if name.starts_with("read_input_") { Bank::Input } else { Bank::Output };
     let read = name.starts_with("read_");
     let write = name.starts_with("write_output_");
-    if !(read || write) {
+    if !(read || write) || name.contains("_port_") {
         return None;
     }
     let access = |host: &mut dyn Host| -> Outcome {
@@ -327,5 +348,6 @@ fn signal(name: &str, x: &Value, y: &Value, host: &mut dyn Host) -> Option<Outco
         })
     };
     let is = ["_digital_in", "_digital_out", "_analog_in", "_analog_out"].iter().any(|e| name.ends_with(e));
+    let is = is && !(name.starts_with("get_") && name.ends_with("_analog_out"));
     is.then(|| access(host).map_err(|e| format!("{name}: {e}")))
 }

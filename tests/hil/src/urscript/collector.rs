@@ -6,8 +6,13 @@ const MAX_PENDING_BYTES: usize = super::lexer::MAX_SOURCE_BYTES;
 /// One complete upload.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Upload {
-    /// Text for [`super::Machine::load`].
-    Program(String),
+    /// Text for [`super::Machine::load_at`].
+    Program {
+        /// The program.
+        text: String,
+        /// Line of its beginning in what the client sent, from 1.
+        first_line: u32,
+    },
     /// The line `stop program`, a command of the port that is not URScript.
     StopProgram,
 }
@@ -19,6 +24,10 @@ pub struct Collector {
     bytes: Vec<u8>,
     program: String,
     depth: usize,
+    /// Complete lines since the beginning of the send.
+    lines: u32,
+    /// Line at which `program` begins, counted from 0.
+    begin: u32,
 }
 
 impl Collector {
@@ -41,7 +50,18 @@ impl Collector {
         Ok(out)
     }
 
+    /// Restarts the line numbers: the client has paused, so that the next bytes are another text.
+    pub fn begin_send(&mut self) {
+        if self.depth == 0 && self.bytes.is_empty() && self.program.trim().is_empty() {
+            self.lines = 0;
+        }
+    }
+
     fn line(&mut self, line: &str) -> Option<Upload> {
+        if self.program.is_empty() {
+            self.begin = self.lines;
+        }
+        self.lines = self.lines.saturating_add(1);
         let words = words(line);
         if self.depth == 0 {
             match words.as_slice() {
@@ -67,7 +87,10 @@ impl Collector {
                 _ => {}
             }
         }
-        (self.depth == 0).then(|| Upload::Program(std::mem::take(&mut self.program)))
+        (self.depth == 0).then(|| Upload::Program {
+            text: std::mem::take(&mut self.program),
+            first_line: self.begin.saturating_add(1),
+        })
     }
 }
 
@@ -109,8 +132,10 @@ mod tests {
     fn programs_end_at_their_matching_end_however_the_bytes_are_split() {
         let whole = Collector::default().push(TEXT.as_bytes()).unwrap();
         assert_eq!(whole.len(), 4);
-        assert!(matches!(&whole[0], Upload::Program(p) if p.starts_with("# head\ndef a") && p.ends_with("end\nend\n")));
-        assert_eq!(whole[1], Upload::Program("set_digital_out(1, True)\n".into()));
+        assert!(
+            matches!(&whole[0], Upload::Program { text, first_line: 1 } if text.starts_with("# head\ndef a") && text.ends_with("end\nend\n"))
+        );
+        assert_eq!(whole[1], Upload::Program { text: "set_digital_out(1, True)\n".into(), first_line: 7 });
         assert_eq!(whole[2], Upload::StopProgram);
         for portion in [1, 2, 3, 7, 50] {
             let mut c = Collector::default();

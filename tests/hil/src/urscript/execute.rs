@@ -4,18 +4,28 @@ use super::arithmetic::{binary, bounded, element, set_element, unary};
 use super::ast::Scope;
 use super::builtins::begin;
 use super::compile::{NameId, Op};
+use super::functions::bind;
 use super::host::Host;
 use super::machine::{MAX_CALL_DEPTH, MAX_THREADS, Machine};
+use super::queue::StatementQueue;
 use super::thread::{Frame, Thread};
 use super::value::Value;
 use super::wait::{Flow, Wait};
+use super::{methods, rpc};
 
 impl Machine {
     /// Executes one operation of thread `i`; returns what the thread now waits for.
     pub(super) fn execute(&mut self, i: usize, op: Op, host: &mut dyn Host) -> Result<Option<Wait>, String> {
         match op {
             Op::Load(_) | Op::Store(..) | Op::StoreIndex(..) => self.access_variable(i, op)?,
-            Op::Push(_) | Op::MakeList(_) | Op::MakePose | Op::Index(_) | Op::Unary(_) | Op::Binary(_) | Op::Pop => {
+            Op::Push(_)
+            | Op::MakeList(_)
+            | Op::MakePose
+            | Op::MakeStruct(_)
+            | Op::Index(_)
+            | Op::Unary(_)
+            | Op::Binary(_)
+            | Op::Pop => {
                 self.evaluate(i, op)?;
             }
             Op::Jump(_) | Op::JumpIfFalse(_) | Op::ShortCircuit(..) | Op::CheckBool | Op::JumpIfSet(..) => {
@@ -24,15 +34,39 @@ impl Machine {
             Op::CallUser(callee, names) => self.call(i, callee, &names)?,
             Op::CallBuiltin(name, names) => {
                 let arguments = self.pop_many(i, names.len());
+                if StatementQueue::has_function(&name) {
+                    return self.control_interpreter(i, &name, arguments, &names);
+                }
                 let free = self.mover.is_none();
                 match begin(&name, arguments, &names, free, host, &mut self.sockets)? {
                     Flow::Value(v) => self.threads[i].stack.push(bounded(v)?),
                     Flow::Wait(wait) => return Ok(Some(wait)),
                 }
             }
+            Op::CallMethod(method, arguments) => {
+                let arguments = self.pop_many(i, arguments);
+                let base = self.pop(i);
+                if let Value::Rpc(_) = base {
+                    return rpc::begin(&base, &method, &arguments, host).map(Some);
+                }
+                let (value, _) = methods::call(&base, &method, &arguments)?;
+                self.threads[i].stack.push(value);
+            }
+            Op::CallVariableMethod(name, path, method, arguments) => {
+                let arguments = self.pop_many(i, arguments);
+                let path = self.pop_many(i, path);
+                return self.call_method(i, name, &path, &method, &arguments, host);
+            }
             Op::Return => {
-                self.threads[i].frames.pop();
-                if self.threads[i].frames.is_empty() {
+                let frame = self.threads[i].frames.pop();
+                if frame.is_some_and(|f| f.statement) {
+                    self.pop(i);
+                    if self.interpreter.is_active() {
+                        return Ok(Some(Wait::Interpreter));
+                    }
+                    // The call of interpreter_mode returns.
+                    self.threads[i].stack.push(Value::None);
+                } else if self.threads[i].frames.is_empty() {
                     self.threads[i].end();
                 }
             }
@@ -42,6 +76,52 @@ impl Machine {
             // The caller ends the program before it executes this.
             Op::Halt => {}
         }
+        Ok(None)
+    }
+
+    /// `interpreter_mode`, `end_interpreter` and `clear_interpreter`.
+    fn control_interpreter(
+        &mut self,
+        i: usize,
+        name: &str,
+        arguments: Vec<Value>,
+        names: &[Option<String>],
+    ) -> Result<Option<Wait>, String> {
+        let bound = bind(name, arguments, names).ok_or_else(|| format!("'{name}' has no parameters"))??;
+        match (name, bound.as_slice()) {
+            ("interpreter_mode", [Value::Bool(clear_on_enter), Value::Bool(clear_on_end)]) => {
+                self.interpreter.enter(*clear_on_enter, *clear_on_end)?;
+                return Ok(Some(Wait::Interpreter));
+            }
+            ("interpreter_mode", _) => return Err("interpreter_mode needs two booleans".to_owned()),
+            ("end_interpreter", _) => self.interpreter.end(),
+            _ => self.interpreter.clear(),
+        }
+        self.threads[i].stack.push(Value::None);
+        Ok(None)
+    }
+
+    /// Calls a method of a variable or of one of its elements, and stores the changed list.
+    fn call_method(
+        &mut self,
+        i: usize,
+        name: NameId,
+        path: &[Value],
+        method: &str,
+        arguments: &[Value],
+        host: &mut dyn Host,
+    ) -> Result<Option<Wait>, String> {
+        let mut variable = self.variable(i, name).cloned().ok_or_else(|| self.undefined(name))?;
+        let base = element(&variable, path)?;
+        if let Value::Rpc(_) = base {
+            return rpc::begin(&base, method, arguments, host).map(Some);
+        }
+        let (value, changed) = methods::call(&base, method, arguments)?;
+        if let Some(changed) = changed {
+            set_element(&mut variable, path, changed)?;
+            self.assign(i, Scope::Free, name, bounded(variable)?);
+        }
+        self.threads[i].stack.push(value);
         Ok(None)
     }
 
@@ -80,6 +160,10 @@ impl Machine {
                 let items = Value::List(self.pop_many(i, 6));
                 Value::Pose(items.as_six().ok_or("a pose needs six numbers")?)
             }
+            Op::MakeStruct(names) => {
+                let values = self.pop_many(i, names.len());
+                bounded(Value::Struct(names.into_iter().zip(values).collect()))?
+            }
             Op::Index(n) => {
                 let path = self.pop_many(i, n);
                 let base = self.pop(i);
@@ -108,7 +192,8 @@ impl Machine {
         match *op {
             Op::Jump(target) => self.jump(i, target),
             Op::JumpIfFalse(target) => {
-                if !self.pop_condition(i)? {
+                let holds = self.pop_condition(i)?;
+                if !holds {
                     self.jump(i, target);
                 }
             }
@@ -208,14 +293,14 @@ impl Machine {
 
     /// Assigns to a local of that name, else to a global, else to a new local. The top level of the program is global.
     fn assign(&mut self, i: usize, scope: Scope, name: NameId, value: Value) {
-        let entry = self.program.entry;
         let global_exists = self.globals.get(name).is_some_and(Option::is_some);
         let Some(frame) = self.threads[i].frames.last_mut() else { return };
+        let top_level = self.program.routines.get(frame.routine).is_some_and(|r| r.top_level);
         let local = frame.locals.iter_mut().find(|(n, _)| *n == name);
         match (scope, local) {
             (Scope::Local | Scope::Free, Some((_, slot))) => *slot = value,
-            (Scope::Local, None) if frame.routine != entry => frame.locals.push((name, value)),
-            (Scope::Free, None) if frame.routine != entry && !global_exists => frame.locals.push((name, value)),
+            (Scope::Local, None) if !top_level => frame.locals.push((name, value)),
+            (Scope::Free, None) if !top_level && !global_exists => frame.locals.push((name, value)),
             _ => {
                 if let Some(slot) = self.globals.get_mut(name) {
                     *slot = Some(value);
@@ -276,7 +361,7 @@ impl Machine {
                 return Err(format!("'{}' needs argument '{name}'", routine.name));
             }
         }
-        self.threads[i].frames.push(Frame { routine: callee, at: 0, locals });
+        self.threads[i].frames.push(Frame { routine: callee, at: 0, locals, statement: false });
         Ok(())
     }
 }

@@ -137,21 +137,39 @@ impl Parser<'_> {
         node(ExprKind::Unary(op, Box::new(inner)), line, below)
     }
 
+    /// Parses elements `[...]`, members `.name` and remote calls `.name(...)` after a value.
     fn postfix(&mut self) -> Result<Expr, ScriptError> {
-        let base = self.primary()?;
-        if !self.is_symbol("[") {
-            return Ok(base);
+        let mut base = self.primary()?;
+        loop {
+            let line = base.line;
+            let mut path = Vec::new();
+            let mut method = None;
+            loop {
+                if self.take_symbol("[") {
+                    let items = self.items("]")?;
+                    if items.is_empty() {
+                        return Err(ScriptError::new(line, "an index is missing between '[' and ']'"));
+                    }
+                    path.extend(items);
+                } else if self.take_symbol(".") {
+                    let name = self.identifier("a member's name")?;
+                    if self.take_symbol("(") {
+                        method = Some((name, self.arguments()?));
+                        break;
+                    }
+                    path.push(node(ExprKind::Literal(Value::Str(name)), line, 0)?);
+                } else {
+                    break;
+                }
+            }
+            if !path.is_empty() {
+                let below = base.depth.max(deepest(&path));
+                base = node(ExprKind::Index(Box::new(base), path), line, below)?;
+            }
+            let Some((name, arguments)) = method else { return Ok(base) };
+            let below = base.depth.max(deepest(arguments.iter().map(|a| &a.value)));
+            base = node(ExprKind::Method(Box::new(base), name, arguments), line, below)?;
         }
-        let line = base.line;
-        let mut path = Vec::new();
-        while self.take_symbol("[") {
-            path.extend(self.items("]")?);
-        }
-        if path.is_empty() {
-            return Err(ScriptError::new(line, "an index is missing between '[' and ']'"));
-        }
-        let below = base.depth.max(deepest(&path));
-        node(ExprKind::Index(Box::new(base), path), line, below)
     }
 
     /// Parses expressions separated by commas, and the closing bracket.

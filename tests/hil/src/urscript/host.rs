@@ -115,6 +115,8 @@ pub struct RobotView {
     pub tcp_speed_actual: PoseVector,
     /// Target TCP twist.
     pub tcp_speed_target: PoseVector,
+    /// TCP pose at the end of the present move, or of the last one.
+    pub target_waypoint: PoseVector,
     /// Wrench at the TCP.
     pub tcp_force: PoseVector,
     /// Active TCP in the flange frame.
@@ -127,6 +129,32 @@ pub struct RobotView {
     pub steady: bool,
     /// Speed slider times scaling, 0 to 1.
     pub speed_fraction: f64,
+}
+
+/// Arguments of `force_mode`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ForceMode {
+    /// Force frame relative to the base frame.
+    pub task_frame: PoseVector,
+    /// Compliant axes of the force frame.
+    pub compliant: [bool; 6],
+    /// Wrench that the robot applies to its environment along the compliant axes, N and Nm.
+    pub wrench: PoseVector,
+    /// 1: y axis from the TCP towards the frame's origin; 2: as given; 3: x axis along the TCP's velocity.
+    pub frame_type: i32,
+    /// Largest speeds of compliant axes (m/s, rad/s), largest deviations of the others (m, rad).
+    pub limits: PoseVector,
+}
+
+/// Progress of a remote procedure call.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Remote {
+    /// No response yet; ask again in the next step.
+    Pending,
+    /// Body of the response.
+    Response(Vec<u8>),
+    /// The call failed, with the reason.
+    Failed(String),
 }
 
 /// A request for inverse kinematics.
@@ -292,8 +320,32 @@ pub trait Host {
         Received::Closed
     }
 
-    /// Settings that the interpreter accepts without meaning of its own (`force_mode`, `zero_ftsensor`, `set_gravity`,
-    /// `freedrive_mode`, ...), with their arguments in order: to be recorded, or refused in a state that does not allow them.
+    /// Begins or changes force mode.
+    ///
+    /// # Errors
+    /// Force mode is not possible in this state.
+    fn force_mode(&mut self, mode: &ForceMode) -> Result<(), HostError> {
+        let _ = mode;
+        Err(HostError::Refused("force_mode: this host has no force control".to_owned()))
+    }
+    /// Ends force mode.
+    fn end_force_mode(&mut self) {}
+
+    /// Sends an HTTP POST request with an XML body. Never blocks; returns a number for [`Host::rpc_poll`].
+    ///
+    /// # Errors
+    /// The URL is invalid, or too many calls are under way.
+    fn rpc_begin(&mut self, url: &str, body: &str) -> Result<u32, HostError> {
+        let _ = (url, body);
+        Err(HostError::Refused("rpc_factory: this host makes no remote procedure calls".to_owned()))
+    }
+    /// Progress of a request.
+    fn rpc_poll(&mut self, call: u32) -> Remote {
+        let _ = call;
+        Remote::Failed("no such call".to_owned())
+    }
+
+    /// A function that is accepted without effect, with its arguments: may be refused in a state that does not allow it.
     ///
     /// # Errors
     /// Refused in this state.
@@ -301,10 +353,10 @@ pub trait Host {
         let _ = (name, arguments);
         Ok(())
     }
-    /// Any function that the interpreter does not know: return its value, or `UnknownFunction` as by default.
+    /// A query function that the interpreter does not evaluate itself, with its arguments.
     ///
     /// # Errors
-    /// Unknown to this host too, or refused.
+    /// The host does not know the function, or refuses.
     fn call(&mut self, name: &str, arguments: &[Value]) -> Result<Value, HostError> {
         let _ = arguments;
         Err(HostError::UnknownFunction(name.to_owned()))

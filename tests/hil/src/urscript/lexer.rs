@@ -26,17 +26,18 @@ pub(crate) struct Lexed {
 const SYMBOLS: [&str; 20] =
     ["==", "!=", "<=", ">=", "(", ")", "[", "]", ",", ":", "=", "<", ">", "+", "-", "*", "/", "%", ".", ";"];
 
-pub(crate) fn lex(text: &str) -> Result<Vec<Lexed>, ScriptError> {
+/// Splits a text into tokens; its first line has number `first_line`.
+pub(crate) fn lex(text: &str, first_line: u32) -> Result<Vec<Lexed>, ScriptError> {
     if text.len() > MAX_SOURCE_BYTES {
         return Err(ScriptError::new(
-            1,
+            first_line,
             format!("the program has {} bytes, the maximum is {MAX_SOURCE_BYTES}", text.len()),
         ));
     }
     let mut out = Vec::new();
     let mut brackets = 0_usize;
     for (number, raw) in text.split('\n').enumerate() {
-        let line = u32::try_from(number + 1).unwrap_or(u32::MAX);
+        let line = u32::try_from(number).unwrap_or(u32::MAX).saturating_add(first_line);
         let before = out.len();
         lex_line(raw, line, &mut brackets, &mut out)?;
         if out.len() > before && brackets == 0 {
@@ -76,6 +77,8 @@ fn lex_line(raw: &str, line: u32, brackets: &mut usize, out: &mut Vec<Lexed>) ->
                 _ => {}
             }
             (Token::Symbol(s), s.len())
+        } else if first == '\u{feff}' {
+            return Err(ScriptError::new(line, "the text begins with a byte order mark; save it as UTF-8 without one"));
         } else {
             return Err(ScriptError::new(line, format!("unexpected character {first:?}")));
         };

@@ -7,8 +7,9 @@ use super::error::{RuntimeError, ScriptError};
 use super::host::{Host, StepOutcome};
 use super::lexer::lex;
 use super::parser::parse;
+use super::queue::StatementQueue;
 use super::sockets::SocketBuffers;
-use super::thread::Thread;
+use super::thread::{Frame, Thread};
 use super::value::Value;
 use super::wait::{Flow, Wait};
 
@@ -41,6 +42,7 @@ pub struct Machine {
     /// Thread that waits for its motion.
     pub(super) mover: Option<u32>,
     pub(super) sockets: SocketBuffers,
+    pub(super) interpreter: StatementQueue,
     ended: Option<StepOutcome>,
 }
 
@@ -58,7 +60,15 @@ impl Machine {
     /// # Errors
     /// The first error with its line; unknown names are reported together.
     pub fn load(text: &str) -> Result<Self, ScriptError> {
-        let program = compile(&parse(&lex(text)?)?)?;
+        Self::load_at(text, 1)
+    }
+
+    /// Like [`Machine::load`] for a text whose first line has number `first_line` in the upload.
+    ///
+    /// # Errors
+    /// As [`Machine::load`].
+    pub fn load_at(text: &str, first_line: u32) -> Result<Self, ScriptError> {
+        let program = compile(&parse(&lex(text, first_line)?)?)?;
         let globals = vec![None; program.names.len()];
         let main = Thread::new(1, program.entry);
         Ok(Self {
@@ -68,6 +78,7 @@ impl Machine {
             next_id: 2,
             mover: None,
             sockets: SocketBuffers::default(),
+            interpreter: StatementQueue::default(),
             ended: None,
         })
     }
@@ -175,6 +186,14 @@ impl Machine {
     fn turn(&mut self, i: usize, host: &mut dyn Host) -> Result<Turn, String> {
         if let Some(wait) = self.threads[i].wait.take() {
             let value = match wait {
+                Wait::Interpreter => {
+                    let Some(routine) = self.interpreter.next() else {
+                        self.threads[i].wait = Some(Wait::Interpreter);
+                        return Ok(Turn::Over);
+                    };
+                    self.threads[i].frames.push(Frame { routine, at: 0, locals: Vec::new(), statement: true });
+                    return self.instructions(i, host);
+                }
                 Wait::Thread(t) => {
                     let alive = self.threads.iter().any(|f| f.id == t && !f.dead);
                     if alive { Flow::Wait(Wait::Thread(t)) } else { Flow::Value(Value::None) }
@@ -194,6 +213,11 @@ impl Machine {
                 }
             }
         }
+        self.instructions(i, host)
+    }
+
+    /// Executes the instructions of one thread until it waits or ends.
+    fn instructions(&mut self, i: usize, host: &mut dyn Host) -> Result<Turn, String> {
         for _ in 0..MAX_INSTRUCTIONS {
             let Some(frame) = self.threads[i].frames.last_mut() else {
                 self.threads[i].dead = true;

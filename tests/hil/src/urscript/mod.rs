@@ -15,7 +15,8 @@
 //! - any outcome except `Running`, a watchdog stop and a safety stop end the program: the host removes the watchdogs and brings
 //!   the arm to rest;
 //! - query functions of the controller that no motion program needs (`is_within_safety_limits`, `tool_contact`,
-//!   `get_actual_joint_positions_history`, ...) are passed to [`Host::call`] with their arguments bound.
+//!   `get_actual_joint_positions_history`, ...) are passed to [`Host::call`] with their arguments bound;
+//! - [`Machine::interpret`] answers the lines of the interpreter port.
 //!
 //! Sources: UR's script manual, and UR's and SDU's published scripts. Where documents are silent the stricter reading is
 //! implemented, so that a script that runs here is likely to run on a robot.
@@ -28,12 +29,16 @@ mod compile;
 mod error;
 mod execute;
 mod expression;
+mod functions;
 mod host;
+mod interpreter;
 mod lexer;
 mod machine;
+mod methods;
 mod parser;
 mod pure;
-mod signature;
+mod queue;
+mod rpc;
 mod sockets;
 mod thread;
 mod value;
@@ -41,9 +46,11 @@ mod wait;
 
 pub use collector::{Collector, Upload};
 pub use error::{HostError, RuntimeError, ScriptError};
+pub use functions::{accepted_without_effect, refused};
 pub use host::{
-    Bank, Connect, Host, JOINTS, JointVector, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup, PoseVector,
-    Received, RobotView, StepOutcome, Target, WatchdogAction,
+    Bank, Connect, ForceMode, Host, JOINTS, JointVector, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup,
+    PoseVector, Received, Remote, RobotView, StepOutcome, Target, WatchdogAction,
 };
+pub use interpreter::no_program;
 pub use machine::{MAX_CALL_DEPTH, MAX_INSTRUCTIONS, MAX_THREADS, Machine, ProgramKind};
 pub use value::Value;

@@ -124,6 +124,9 @@ impl<'t> Parser<'t> {
     }
 
     /// Parses statements up to one of the closing words (not consumed), or to the end of the text if there are none.
+    ///
+    /// A line may hold several statements: a name cannot continue an expression, so it begins the next statement. Programs in
+    /// the field write `x = -0.2 show(x)`, and interpreter mode needs functions on one line.
     fn block(&mut self, closers: &[&str]) -> Result<Vec<Stmt>, ScriptError> {
         self.deeper()?;
         let opened = self.line();
@@ -142,20 +145,13 @@ impl<'t> Parser<'t> {
                 break;
             }
             out.push(self.statement()?);
-            let ended =
-                matches!(self.peek(), None | Some(Token::Newline)) || self.is_symbol(";") || self.opens_statement();
-            if !ended && !closers.iter().any(|c| self.is_word(c)) {
+            let ended = matches!(self.peek(), None | Some(Token::Newline | Token::Name(_))) || self.is_symbol(";");
+            if !ended {
                 return Err(self.expected("the end of the statement"));
             }
         }
         self.nesting -= 1;
         Ok(out)
-    }
-
-    /// Whether a keyword follows that can only begin a statement. A line's end is not needed before it: the script that SDU's
-    /// client uploads has `global a = # comment`, and on the next line the value and the next `global`.
-    fn opens_statement(&self) -> bool {
-        ["global", "local", "def", "thread", "if", "while", "return"].iter().any(|w| self.is_word(w))
     }
 
     fn statement(&mut self) -> Result<Stmt, ScriptError> {
@@ -280,15 +276,17 @@ impl<'t> Parser<'t> {
         let expr = self.expression()?;
         if !self.take_symbol("=") {
             return match expr.kind {
-                ExprKind::Call(..) | ExprKind::Run(_) => Ok(StmtKind::Expr(expr)),
-                _ => Err(ScriptError::new(expr.line, "syntax error: a value alone is no statement")),
+                ExprKind::Call(..) | ExprKind::Method(..) | ExprKind::Run(_) => Ok(StmtKind::Expr(expr)),
+                _ => Err(ScriptError::new(expr.line, "syntax error: a value is not a statement")),
             };
         }
         let (name, path) = match expr.kind {
             ExprKind::Name(name) => (name, Vec::new()),
             ExprKind::Index(base, path) => match base.kind {
                 ExprKind::Name(name) => (name, path),
-                _ => return Err(ScriptError::new(expr.line, "only a variable's element can be assigned")),
+                _ => {
+                    return Err(ScriptError::new(expr.line, "only an element or member of a variable can be assigned"));
+                }
             },
             _ => return Err(ScriptError::new(expr.line, "only a variable can be assigned")),
         };

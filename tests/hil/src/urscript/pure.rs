@@ -1,13 +1,11 @@
 //! Built-in functions that depend only on their arguments.
 
-use super::arithmetic::{Outcome, whole};
+use super::arithmetic::{MAX_MATRIX, MAX_TEXT_BYTES, Outcome, whole};
 use super::value::Value;
-use nalgebra::{Isometry3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{DMatrix, Isometry3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
 /// Length limit of `make_list`, exclusive.
 const MAX_LIST: usize = 10_000;
-/// Longest string of a script, bytes.
-pub(crate) const MAX_TEXT: usize = 16_384;
 
 pub(crate) fn number(v: &Value) -> Outcome<f64> {
     v.as_f64().ok_or_else(|| format!("expected a number, got {}", v.type_name()))
@@ -121,8 +119,10 @@ pub(crate) fn call(name: &str, a: &[Value]) -> Option<Outcome> {
         "r2d" => number(x).map(|x| Value::Float(x.to_degrees())),
         "norm" => norm(x),
         "normalize" => normalize(x),
-        "length" | "get_list_length" | "size" => count(x),
+        "length" | "get_list_length" => count(x),
+        "size" => size(x),
         "transpose" => transpose(x),
+        "inv" => inverse(x),
         "make_list" => index(x, MAX_LIST).map(|n| Value::List(vec![y.clone(); n])),
         "binary_list_to_integer" => bits_to_integer(x),
         "integer_to_binary_list" => {
@@ -165,7 +165,7 @@ pub(crate) fn call(name: &str, a: &[Value]) -> Option<Outcome> {
         "str_at" => text(x).and_then(|s| slice(s, y, 1)),
         "str_sub" => text(x).and_then(|s| match z {
             Value::None => slice(s, y, usize::MAX),
-            n => slice(s, y, index(n, MAX_TEXT)?),
+            n => slice(s, y, index(n, MAX_TEXT_BYTES)?),
         }),
         "str_find" => find(x, y, z),
         _ => return None,
@@ -223,6 +223,38 @@ fn transpose(v: &Value) -> Outcome {
     Ok(Value::List((0..width).map(column).collect()))
 }
 
+/// Number of elements; rows and columns of a matrix.
+fn size(v: &Value) -> Outcome {
+    match v {
+        Value::List(rows) => match rows.first() {
+            Some(Value::List(row)) => Ok(Value::List(
+                [rows.len(), row.len()].iter().map(|n| Value::Int(i32::try_from(*n).unwrap_or(i32::MAX))).collect(),
+            )),
+            _ => count(v),
+        },
+        _ => count(v),
+    }
+}
+
+/// Inverse of a square matrix or of a pose.
+fn inverse(v: &Value) -> Outcome {
+    if let Value::Pose(_) = v {
+        return frame(v).map(|p| from_isometry(&p.inverse()));
+    }
+    let Value::List(rows) = v else { return Err(format!("inv: expected a matrix or a pose, got {}", v.type_name())) };
+    let rows: Vec<Vec<f64>> = rows.iter().map(list).collect::<Result<_, _>>().map_err(|e| format!("inv: {e}"))?;
+    let n = rows.len();
+    if n == 0 || n > MAX_MATRIX || rows.iter().any(|r| r.len() != n) {
+        return Err(format!("inv: the matrix must be square with at most {MAX_MATRIX} rows"));
+    }
+    let m = DMatrix::from_row_iterator(n, n, rows.into_iter().flatten());
+    // Adding zero turns the negative zeros of the elimination into zeros.
+    let inverse = m.try_inverse().filter(|m| m.iter().all(|x| x.is_finite())).ok_or("inv: the matrix is singular")?;
+    Ok(Value::List(
+        inverse.row_iter().map(|r| Value::List(r.iter().map(|x| Value::Float(*x + 0.0)).collect())).collect(),
+    ))
+}
+
 fn bits_to_integer(v: &Value) -> Outcome {
     let Value::List(bits) = v else { return Err(format!("expected a list of booleans, got {}", v.type_name())) };
     if bits.len() > 32 {
@@ -242,7 +274,11 @@ fn to_number(s: &str) -> Outcome {
 
 fn concatenate(a: &Value, b: &Value) -> Outcome {
     let out = format!("{a}{b}");
-    if out.len() > MAX_TEXT { Err(format!("a string of more than {MAX_TEXT} bytes")) } else { Ok(Value::Str(out)) }
+    if out.len() > MAX_TEXT_BYTES {
+        Err(format!("a string of more than {MAX_TEXT_BYTES} bytes"))
+    } else {
+        Ok(Value::Str(out))
+    }
 }
 
 fn slice(s: &str, from: &Value, n: usize) -> Outcome {
@@ -251,7 +287,7 @@ fn slice(s: &str, from: &Value, n: usize) -> Outcome {
 }
 
 fn find(s: &Value, target: &Value, from: &Value) -> Outcome {
-    let (s, target, from) = (text(s)?, text(target)?, index(from, MAX_TEXT)?);
+    let (s, target, from) = (text(s)?, text(target)?, index(from, MAX_TEXT_BYTES)?);
     let Some((start, _)) = s.char_indices().nth(from) else { return Ok(Value::Int(-1)) };
     let found = s.get(start..).and_then(|t| t.find(target).map(|n| t.get(..n).map_or(0, |h| h.chars().count())));
     Ok(Value::Int(found.and_then(|n| i32::try_from(n + from).ok()).unwrap_or(-1)))

@@ -1,8 +1,8 @@
 //! Sockets of a script: receive buffers, and conversion between bytes and numbers, lines and strings.
 
-use super::arithmetic::Outcome;
+use super::arithmetic::{MAX_TEXT_BYTES, Outcome};
 use super::host::{Connect, Host, Received};
-use super::pure::{MAX_TEXT, boolean, index, int32, number, text};
+use super::pure::{boolean, index, int32, number, text};
 use super::value::Value;
 use super::wait::{Flow, Read, SocketWait, Wait};
 use std::collections::BTreeMap;
@@ -218,7 +218,7 @@ impl SocketBuffers {
                 let end = line_end(buffer)?;
                 let line: Vec<u8> = buffer.drain(..=end).collect();
                 let text = String::from_utf8_lossy(&line);
-                Some(Value::Str(text.trim_end_matches(['\r', '\n']).chars().take(MAX_TEXT / 4).collect()))
+                Some(Value::Str(text.trim_end_matches(['\r', '\n']).chars().take(MAX_TEXT_BYTES / 4).collect()))
             }
             Read::Any { prefix, suffix } => {
                 let from = position(buffer, prefix)? + prefix.len();
@@ -227,7 +227,7 @@ impl SocketBuffers {
                 if suffix.is_empty() && n == 0 {
                     return None;
                 }
-                let n = n.min(MAX_TEXT / 4);
+                let n = n.min(MAX_TEXT_BYTES / 4);
                 let found = String::from_utf8_lossy(rest.get(..n).unwrap_or_default()).into_owned();
                 buffer.drain(..(from + n + suffix.len()).min(buffer.len()));
                 Some(Value::Str(found))

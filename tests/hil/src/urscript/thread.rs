@@ -11,6 +11,8 @@ pub(super) struct Frame {
     /// Next operation.
     pub(super) at: usize,
     pub(super) locals: Vec<(NameId, Value)>,
+    /// Whether this is a statement of interpreter mode.
+    pub(super) statement: bool,
 }
 
 /// A co-operative thread of a script.
@@ -26,7 +28,7 @@ pub(super) struct Thread {
 
 impl Thread {
     pub(super) fn new(id: u32, routine: usize) -> Self {
-        let frames = vec![Frame { routine, at: 0, locals: Vec::new() }];
+        let frames = vec![Frame { routine, at: 0, locals: Vec::new(), statement: false }];
         Self { id, frames, stack: Vec::new(), wait: None, critical: 0, dead: false }
     }
 

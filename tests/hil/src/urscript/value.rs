@@ -19,6 +19,10 @@ pub enum Value {
     Pose([f64; 6]),
     /// `[...]`.
     List(Vec<Value>),
+    /// `struct(name=value, ...)`: members in the order of their definition.
+    Struct(Vec<(String, Value)>),
+    /// Result of `rpc_factory`: URL of an XML-RPC server.
+    Rpc(String),
     /// Result of `run`; never zero, because scripts use 0 for "no thread".
     Thread(u32),
 }
@@ -67,6 +71,8 @@ impl Value {
             Self::Str(_) => "a string",
             Self::Pose(_) => "a pose",
             Self::List(_) => "a list",
+            Self::Struct(_) => "a struct",
+            Self::Rpc(_) => "a remote procedure call handle",
             Self::Thread(_) => "a thread",
         }
     }
@@ -75,7 +81,8 @@ impl Value {
     pub(crate) fn weight(&self) -> usize {
         match self {
             Self::List(items) => 1 + items.iter().map(Self::weight).sum::<usize>(),
-            Self::Str(s) => 1 + s.len() / 8,
+            Self::Struct(members) => 1 + members.iter().map(|(n, v)| 1 + n.len() / 8 + v.weight()).sum::<usize>(),
+            Self::Str(s) | Self::Rpc(s) => 1 + s.len() / 8,
             Self::Pose(_) => 6,
             _ => 1,
         }
@@ -85,6 +92,7 @@ impl Value {
     pub(crate) fn depth(&self) -> usize {
         match self {
             Self::List(items) => 1 + items.iter().map(Self::depth).max().unwrap_or(0),
+            Self::Struct(members) => 1 + members.iter().map(|(_, v)| v.depth()).max().unwrap_or(0),
             _ => 0,
         }
     }
@@ -116,6 +124,14 @@ impl fmt::Display for Value {
                 commas(f, p.iter().map(|x| short_float(*x)))
             }
             Self::List(items) => commas(f, items.iter()),
+            Self::Struct(members) => {
+                f.write_str("struct(")?;
+                for (i, (name, value)) in members.iter().enumerate() {
+                    write!(f, "{}{name}={value}", if i > 0 { ", " } else { "" })?;
+                }
+                f.write_str(")")
+            }
+            Self::Rpc(url) => write!(f, "rpc({url})"),
             Self::Thread(id) => write!(f, "{id}"),
         }
     }

@@ -11,6 +11,10 @@ pub(crate) enum Wait {
     Popup,
     Thread(u32),
     Socket(SocketWait),
+    /// The next statement of interpreter mode.
+    Interpreter,
+    /// Number of a remote procedure call.
+    Remote(u32),
 }
 
 /// Result of a call so far: its value, or what it waits for.
