@@ -58,6 +58,6 @@ fn run(command: Command) -> Result<Exit, Failure> {
         #[cfg(feature = "demo")]
         Command::MockUr(p) => Ok(cli::simulator(graspd_hil::controller::main_with_args, "graspd-mock-ur", &p.args)),
         #[cfg(feature = "demo")]
-        Command::Scene(p) => Ok(cli::simulator(graspd_hil::scene::main_with_args, "graspd-scene", &p.args)),
+        Command::Scene(p) => Ok(cli::simulator(graspd_hil::scene_program::main_with_args, "graspd-scene", &p.args)),
     }
 }

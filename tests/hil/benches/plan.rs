@@ -1,5 +1,6 @@
-//! Time of the off-line stage from two clicks to a plan on rendered images of 1280x1024, stage by stage, on one thread:
-//! `cargo bench -p graspd-hil --bench plan`. Processor time of this thread, so that a busy host does not count. Prints; never judges.
+//! Time of the off-line stage from two clicks to a plan on rendered images of 1280x1024, stage by stage:
+//! `cargo bench -p graspd-hil --bench plan`. Measures the processor time of one thread, so that the load of the host does not
+//! matter. Only prints; asserts nothing.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::RigFile;

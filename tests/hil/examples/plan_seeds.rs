@@ -1,4 +1,4 @@
-//! Plans on the first images of many random cells and compares with the truth: `plan_seeds FIRST COUNT [occlusion]`.
+//! Plans on the first images of random cells and compares with ground truth: `plan_seeds FIRST COUNT [OCCLUSION]`.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::RigFile;

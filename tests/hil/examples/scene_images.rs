@@ -1,4 +1,4 @@
-//! Draws a scenario's first images: `cargo run --release -p graspd-hil --example scene_images -- SEED FOLDER`.
+//! Renders the first images of a scenario: `cargo run --release -p graspd-hil --example scene_images -- SEED FOLDER`.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::scenario::{Options, Scenario};
@@ -41,6 +41,6 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
     }
     let wall = start.elapsed().as_secs_f64() * 10.0;
-    eprintln!("{wall:.2} ms a pair, of which {:.2} ms on the processor", (cpu() - before) * 1e-2);
+    eprintln!("{wall:.2} ms per pair, of which {:.2} ms processor time", (cpu() - before) * 1e-2);
     Ok(())
 }

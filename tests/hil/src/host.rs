@@ -1,21 +1,22 @@
-//! Asking the host for precedence: a simulated controller and a simulated camera stand for machines of their own, which do not wait
-//! for whatever else a computer does.
+//! Scheduling priority. The simulated controller and cameras stand for separate machines, so they must not wait for
+//! other work of the host.
 
 use std::num::NonZeroU64;
 use thread_priority::unix::{set_thread_priority_and_policy, thread_native_id};
 use thread_priority::{RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy};
 
-/// SCHED_FIFO priority of the mock controller's servo: above the daemon's threads, as a controller is no part of the daemon's machine.
-pub(crate) const CONTROLLER: u8 = 92;
-/// Of the camera's look at the arm, which gives every image its joints.
-pub(crate) const EXPOSURE: u8 = 90;
+/// SCHED_FIFO priority of the mock controller. It is above the daemon's threads, because the real controller is
+/// another machine.
+pub(crate) const CONTROLLER_FIFO: u8 = 92;
+/// SCHED_FIFO priority of the thread that samples the joints for the images.
+pub(crate) const EXPOSURE_FIFO: u8 = 90;
 
-/// Niceness of rendering. It takes a third of a processor, and the kernel stops *all* real-time threads of a processor for 50 ms when
-/// they take more than 95 % of a second: so it may ask for precedence among ordinary programs only.
-pub(crate) const RENDERER: i32 = -10;
+/// Niceness of the renderer. It uses a third of a processor. The kernel stops *all* real-time threads of a processor for
+/// 50 ms when they use more than 95 % of a second, so the renderer only gets a priority among ordinary programs.
+pub(crate) const RENDERER_NICE: i32 = -10;
 
-/// Asks for niceness against everything else on the host. Where the kernel schedules whole sessions against each other, that takes a
-/// session of one's own.
+/// Requests a niceness for this process. With session autogrouping the kernel schedules sessions against each other, so the
+/// process first becomes a session leader.
 pub(crate) fn prefer_this_process(nice: i32) {
     let _ = rustix::process::setsid();
     let own_session = rustix::process::getsid(None).is_ok_and(|s| s == rustix::process::getpid());
@@ -25,8 +26,8 @@ pub(crate) fn prefer_this_process(nice: i32) {
     let _ = rustix::process::setpriority_process(None, nice);
 }
 
-/// Puts the calling thread under SCHED_FIFO, or, where an ordinary user may not ask for that, asks for the niceness `nice` instead.
-/// Best effort: on a quiet host neither is needed.
+/// Puts the calling thread under SCHED_FIFO. Without the privilege for that it requests the niceness `nice` instead.
+/// Failures are ignored: an idle host needs neither.
 pub(crate) fn prefer_this_thread(fifo: u8, nice: i32) {
     let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(1));
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);

@@ -1,4 +1,4 @@
-//! The daemon's own control script under the interpreter: handshake, rates, refusals, a heartbeat that stops.
+//! The daemon's control script in the interpreter: handshake, rates, refusals, a heartbeat that stops.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod desk;
@@ -9,7 +9,7 @@ use graspd_hil::urscript::{Machine, Motion, StepOutcome, WatchdogAction};
 const TOKEN: i32 = 77;
 const PATIENCE: usize = 5;
 
-/// The template with the values that the daemon would fill in.
+/// The template with the daemon's values filled in.
 fn script() -> String {
     let mut text = include_str!("../../../daemon/dist/graspd_control.script").to_owned();
     for (key, value) in [
@@ -33,7 +33,7 @@ fn script() -> String {
     text
 }
 
-/// One step with a fresh cycle.
+/// One step with a new heartbeat.
 fn cycle(m: &mut Machine, desk: &mut Desk) {
     desk.ints[25] += 1;
     assert_eq!(m.step(desk), StepOutcome::Running);
@@ -58,7 +58,7 @@ fn last_rates(desk: &Desk) -> [f64; 6] {
 }
 
 #[test]
-fn nothing_moves_without_our_token() {
+fn nothing_moves_without_the_token() {
     let mut m = Machine::load(&script()).unwrap();
     let mut desk = Desk::default();
     let mut outcome = StepOutcome::Running;
@@ -72,7 +72,7 @@ fn nothing_moves_without_our_token() {
 }
 
 #[test]
-fn rates_reach_the_arm_and_the_heartbeat_comes_back() {
+fn rates_reach_the_arm_and_the_heartbeat_is_echoed() {
     let (mut m, mut desk) = ready();
     assert_eq!(desk.watchdog, Some(("input_int_register_25".into(), 20.0, WatchdogAction::Stop)));
     desk.ints[24] = 1;
@@ -85,7 +85,7 @@ fn rates_reach_the_arm_and_the_heartbeat_comes_back() {
 }
 
 #[test]
-fn a_rate_over_the_limit_or_nan_is_refused_and_the_arm_told_to_rest() {
+fn a_rate_above_the_limit_or_nan_is_refused_and_the_arm_stopped() {
     for bad in [1.5, -1.5, f64::NAN, f64::INFINITY] {
         let (mut m, mut desk) = ready();
         desk.ints[24] = 1;
@@ -99,7 +99,7 @@ fn a_rate_over_the_limit_or_nan_is_refused_and_the_arm_told_to_rest() {
 }
 
 #[test]
-fn a_heartbeat_that_stops_stops_the_arm_in_bound() {
+fn a_missing_heartbeat_stops_the_arm_within_the_stated_time() {
     let (mut m, mut desk) = ready();
     desk.ints[24] = 1;
     desk.floats[30] = 3.0;

@@ -1,4 +1,4 @@
-//! The robot on a virtual clock: the daemon's own control script, its watchdog, every stop, and the RTDE half byte for byte.
+//! The robot on a virtual clock: the daemon's control script, its watchdog, every stop, and the RTDE session byte by byte.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command, RobotMode, Rule, RuntimeState, SafetyMode, Setup, Upload};
@@ -43,7 +43,7 @@ struct Client {
 }
 
 impl Client {
-    /// The script runs and has shaken hands.
+    /// A client after the handshake with the running script.
     fn ready() -> Client {
         let mut c = Client { arm: arm(), cycle: 0, rate: 0.0 };
         assert_eq!(c.arm.upload(&script()), Upload::Main);
@@ -73,7 +73,7 @@ impl Client {
         self.arm.step();
     }
 
-    /// Up to `rate`, at the promised acceleration, and on for a while.
+    /// Accelerates to `rate` at the stated limit, then continues for some time.
     fn run_up(&mut self, rate: f64) {
         while self.rate < rate {
             let next = (self.rate + 4.0 * 0.002).min(rate);
@@ -86,7 +86,7 @@ impl Client {
 }
 
 #[test]
-fn the_daemons_script_moves_the_arm_within_its_promise() {
+fn the_daemons_script_moves_the_arm_within_the_stated_limits() {
     let mut c = Client::ready();
     let start = c.arm.robot().truth.actual_q[0];
     c.run_up(0.4);
@@ -97,10 +97,10 @@ fn the_daemons_script_moves_the_arm_within_its_promise() {
 }
 
 #[test]
-fn a_client_that_dies_in_motion_leaves_the_arm_at_rest_within_watchdog_and_ramp() {
+fn the_arm_stops_within_watchdog_and_ramp_when_the_client_dies_in_motion() {
     let mut slowest = 0.0f64;
     for k in 0..100u32 {
-        // A hundred instants and speeds, spread by the golden ratio: the same in every run.
+        // A hundred times and speeds, spread by the golden ratio.
         let spread = f64::from(k) * 0.618_033_988_75 % 1.0;
         let (steps, rate) = ((spread * 83.0) as u32, 0.1 + 0.4 * f64::from(k) / 99.0);
         let mut c = Client::ready();
@@ -108,23 +108,23 @@ fn a_client_that_dies_in_motion_leaves_the_arm_at_rest_within_watchdog_and_ramp(
         for _ in 0..steps {
             c.command(1, rate);
         }
-        // Not one byte more.
-        assert!(c.arm.step_until(1.0, |r| r.at_rest()), "still moving a second later");
+        // The client sends nothing more.
+        assert!(c.arm.step_until(1.0, |r| r.at_rest()), "the arm still moves after 1 s");
         let last = *c.arm.summary().episodes.last().unwrap();
         let bound = 0.050 + rate / 4.0 + 0.030; // the drives trail their targets by a few hundredths
         let took = last.stop_ns().unwrap() as f64 * 1e-9;
         slowest = slowest.max(took - rate / 4.0);
         assert!(took <= bound, "{last:?}");
-        assert!(!c.arm.step_until(0.5, |r| !r.at_rest()), "it moved again by itself");
-        // Its watchdog ended the program, too.
+        assert!(!c.arm.step_until(0.5, |r| !r.at_rest()), "the arm moved again");
+        // The watchdog also ended the program.
         assert_eq!(c.arm.robot().runtime, RuntimeState::Stopped);
     }
     println!("slowest of 100: {:.1} ms beyond the ramp", slowest * 1e3);
 }
 
 #[test]
-fn without_a_watchdog_and_without_patience_the_arm_goes_on_for_ever() {
-    // What the watchdog is for: `speedj` alone keeps moving.
+fn speedj_without_a_watchdog_continues_without_end() {
+    // The reason for the watchdog.
     let mut arm = arm();
     arm.upload("def f():\n  while True:\n    speedj([0.2, 0, 0, 0, 0, 0], 2, get_steptime())\n  end\nend\n");
     arm.step_until(3.0, |_| false);
@@ -134,7 +134,7 @@ fn without_a_watchdog_and_without_patience_the_arm_goes_on_for_ever() {
 }
 
 #[test]
-fn every_stop_brings_the_arm_to_rest_and_keeps_it_there() {
+fn every_stop_brings_the_arm_to_rest_and_keeps_it_at_rest() {
     type Act = (&'static str, Command, f64);
     let acts: [Act; 8] = [
         ("protective", Command::ProtectiveStop, 0.1),
@@ -158,14 +158,14 @@ fn every_stop_brings_the_arm_to_rest_and_keeps_it_there() {
         }
         for _ in 0..500 {
             c.command(1, 0.4);
-            assert!(c.arm.robot().at_rest(), "{name}: moves on although stopped");
+            assert!(c.arm.robot().at_rest(), "{name}: moves although stopped");
         }
         assert!(!c.arm.robot().is_program_running(), "{name}");
     }
 }
 
 #[test]
-fn a_stopped_robot_refuses_programs_and_says_why() {
+fn a_stopped_robot_refuses_programs_with_a_reason() {
     let mut a = arm();
     a.command(Command::ProtectiveStop).unwrap();
     assert!(
@@ -179,7 +179,7 @@ fn a_stopped_robot_refuses_programs_and_says_why() {
 }
 
 #[test]
-fn reported_faults_are_seen_and_the_truth_stays() {
+fn report_faults_change_the_report_and_not_the_robot() {
     let mut a = arm();
     a.step();
     let q = a.robot().truth.actual_q;
@@ -209,7 +209,7 @@ fn a_stuck_joint_leads_to_a_protective_stop() {
 }
 
 #[test]
-fn the_oracle_sees_a_client_that_breaks_its_promise() {
+fn the_judge_detects_a_client_that_exceeds_its_limits() {
     let mut c = Client::ready();
     c.command(1, 0.3);
     assert_eq!(c.arm.summary().violations[0].rule, Rule::Accel);
@@ -219,7 +219,7 @@ fn the_oracle_sees_a_client_that_breaks_its_promise() {
 }
 
 #[test]
-fn the_units_own_kinematics_decide_where_the_tool_is() {
+fn calibrated_kinematics_determine_the_tool_pose() {
     let nominal = arm();
     let mut setup = Setup::new(Model::by_name("ur5e").unwrap());
     setup.kinematics = Kinematics {
@@ -235,7 +235,7 @@ fn the_units_own_kinematics_decide_where_the_tool_is() {
 
 #[test]
 fn the_mocks_kinematics_agree_with_the_daemons() {
-    // Two implementations that share no line.
+    // Two independent implementations.
     let q = [0.3, -1.2, 1.4, -0.9, 1.1, 0.5];
     for model in Model::all() {
         let other = graspd_rt::arm::Model::from_name(model.name).unwrap();
@@ -313,17 +313,17 @@ fn start_pause_start_does_not_double_the_rate() {
 }
 
 #[test]
-fn inputs_belong_to_one_client_until_it_leaves() {
+fn inputs_are_owned_by_one_client_until_it_disconnects() {
     let mut a = arm();
     let (one, two) = (a.connect(), a.connect());
     let setup = package(73, b"input_int_register_24,input_double_register_24,");
     assert_eq!(answers(&mut a, one, &setup), [(73, b"\x01INT32,DOUBLE".to_vec())]);
     assert_eq!(answers(&mut a, two, &setup), [(73, b"\x00IN_USE,IN_USE".to_vec())]);
-    // The owner may hold the same variable in a second recipe.
+    // The owner may use the same variable in a second recipe.
     assert_eq!(answers(&mut a, one, &package(73, b"input_int_register_24")), [(73, b"\x02INT32".to_vec())]);
     let unknown = package(73, b"input_int_register_25,nonsense");
     assert_eq!(answers(&mut a, two, &unknown), [(73, b"\x00INT32,NOT_FOUND".to_vec())]);
-    // Of a recipe that failed nothing is kept.
+    // A failed recipe owns nothing.
     assert_eq!(answers(&mut a, one, &package(73, b"input_int_register_25")), [(73, b"\x03INT32".to_vec())]);
     a.send(one, &package(85, &[2, 0, 0, 0, 9])).unwrap();
     assert_eq!(a.robot().inputs.ints[24], 9, "written without a start");
@@ -333,7 +333,7 @@ fn inputs_belong_to_one_client_until_it_leaves() {
 }
 
 #[test]
-fn masks_choose_what_an_output_package_sets() {
+fn masks_select_the_outputs_that_a_package_sets() {
     let mut a = arm();
     let c = a.connect();
     a.send(
@@ -368,9 +368,9 @@ fn version_1_and_refusals() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(std::env::var("GRASPD_FUZZ_CASES").ok().and_then(|v| v.parse().ok()).unwrap_or(300)))]
 
-    /// Arbitrary bytes, cut anyhow: no panic, and the cut does not matter.
+    /// Arbitrary bytes: no panic, and the result does not depend on how they are split.
     #[test]
-    fn arbitrary_bytes_have_the_same_effect_in_every_cut(
+    fn arbitrary_bytes_have_the_same_effect_however_they_are_split(
         bytes in proptest::collection::vec(any::<u8>(), 0..400),
         well_formed in proptest::collection::vec((prop_oneof![Just(86u8), Just(79), Just(73), Just(83), Just(80), Just(85), Just(77), any::<u8>()],
             proptest::collection::vec(any::<u8>(), 0..60)), 0..8),
@@ -398,7 +398,7 @@ proptest! {
         prop_assert_eq!(whole.1, pieces.1);
     }
 
-    /// Arbitrary text as a script: an answer, never a panic, and the robot lives.
+    /// Arbitrary text as a script: an answer, no panic, and the robot keeps running.
     #[test]
     fn arbitrary_scripts_leave_the_robot_alive(text in "[a-z0-9_()\\[\\]=+,.:# \n\"]{0,200}") {
         let mut a = arm();
@@ -411,8 +411,8 @@ proptest! {
 }
 
 #[test]
-fn a_stream_at_the_promise_passes_and_each_step_beyond_it_is_seen() {
-    // Up and down at exactly 4 rad/s2 to exactly 0.5 rad/s, through the real packages.
+fn a_stream_at_the_limits_passes_and_every_violation_is_detected() {
+    // Up and down with exactly 4 rad/s2 to exactly 0.5 rad/s, as RTDE packages.
     let mut c = Client::ready();
     for sign in [1.0, -1.0] {
         for k in 0..=62 {
@@ -434,7 +434,7 @@ fn a_stream_at_the_promise_passes_and_each_step_beyond_it_is_seen() {
         rules.dedup();
         rules
     };
-    // A hair beyond each: 1 % is allowed to the acceleration for rounding, nothing to the rate.
+    // Slightly beyond each limit: the acceleration has a tolerance of 1 % for rounding, the rate has none.
     assert_eq!(rules(&|c| c.command(1, 0.008 * 1.005)), []);
     assert_eq!(rules(&|c| c.command(1, 0.008 * 1.02)), [Rule::Accel]);
     assert_eq!(
@@ -446,7 +446,7 @@ fn a_stream_at_the_promise_passes_and_each_step_beyond_it_is_seen() {
     );
     assert_eq!(rules(&|c| c.command(1, f64::NAN)), [Rule::Finite]);
     assert_eq!(rules(&|c| c.command(0, 0.004)), [Rule::ZeroUnlessVelocity]);
-    // A client that has just connected begins from rest.
+    // A client that has just connected starts from rest.
     assert_eq!(
         rules(&|c| {
             c.run_up(0.3);

@@ -1,5 +1,5 @@
-//! The program `graspd-mock-ur` as a process of its own under hostile clients: slow ones, ones that reset, ones that never read, and a
-//! thousand reconnects. Its open files, threads and memory are counted from outside. No time is asserted from below.
+//! The program `graspd-mock-ur` as a separate process with hostile clients: slow ones, ones that reset, ones that never read,
+//! and a thousand reconnects. Its open files, threads and memory are measured from outside.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use serde_json::Value as Json;
@@ -41,7 +41,7 @@ impl Mock {
             BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
             match serde_json::from_str::<Json>(&line) {
                 Ok(ready) => return Mock { child, address, control: ready["control"].as_u64().unwrap() as u16 },
-                // Somebody else's mock stands there.
+                // Another mock uses this address.
                 Err(_) => drop(child.wait()),
             }
         }
@@ -56,15 +56,15 @@ impl Mock {
                     s.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
                     return s;
                 }
-                // Ports of this end run out for a moment after thousands of connections.
+                // After thousands of connections the local ports are exhausted for a short time.
                 Err(e) => assert!(begin.elapsed() < Duration::from_secs(20), "{port}: {e}"),
             }
             std::thread::sleep(Duration::from_millis(10));
         }
     }
 
-    /// It answers on its control port and its RTDE port, and its clock runs.
-    fn is_well(&self) {
+    /// Checks that the control port and the RTDE port answer and that the clock runs.
+    fn check_alive(&self) {
         let mut control = BufReader::new(self.connect(self.control));
         let mut clocks = Vec::new();
         for _ in 0..2 {
@@ -94,7 +94,7 @@ impl Mock {
         line.split_whitespace().nth(1).unwrap().parse().unwrap()
     }
 
-    /// Waits until the files that clients held are closed again.
+    /// Waits until the files of the clients are closed.
     fn settles(&self, files: usize) {
         let begin = Instant::now();
         while self.count("fd") > files {
@@ -116,7 +116,7 @@ fn reset(s: TcpStream) {
     drop(s);
 }
 
-/// What a client says first, for each port; cut anywhere by the tests.
+/// The first bytes of a client for each port; the tests cut them at any position.
 fn talk(port: u16) -> Vec<u8> {
     let mut out = Vec::new();
     let mut put = |kind: u8, body: &[u8]| {
@@ -140,14 +140,14 @@ fn talk(port: u16) -> Vec<u8> {
 }
 
 #[test]
-fn a_thousand_reconnects_cut_anywhere_leave_files_threads_and_memory_as_they_were() {
+fn a_thousand_reconnects_leak_no_files_threads_or_memory() {
     let mock = Mock::start();
     let round = |from: usize, n: usize| {
         for k in from..from + n {
             let port = PORTS[k % PORTS.len()];
             let words = talk(port);
             let mut s = mock.connect(port);
-            // The other end may have cut us off already.
+            // The mock may have closed the connection already.
             let _ = s.write_all(&words[..(k * 7919) % (words.len() + 1)]);
             if k % 3 == 0 {
                 let _ = s.read(&mut [0; 512]);
@@ -155,13 +155,13 @@ fn a_thousand_reconnects_cut_anywhere_leave_files_threads_and_memory_as_they_wer
             if k % 2 == 0 { reset(s) } else { drop(s) }
         }
     };
-    // Everything that is allocated once, is.
+    // After this all one-time allocations are done.
     round(0, 200);
-    mock.is_well();
+    mock.check_alive();
     mock.settles(mock.count("fd").min(24));
     let (files, threads, before) = (mock.count("fd"), mock.count("task"), mock.resident());
     round(200, 1000);
-    mock.is_well();
+    mock.check_alive();
     mock.settles(files);
     let after = mock.resident();
     println!("1000 reconnects: {files} files, {threads} threads, {before} -> {after} KiB");
@@ -170,7 +170,7 @@ fn a_thousand_reconnects_cut_anywhere_leave_files_threads_and_memory_as_they_wer
 }
 
 #[test]
-fn a_reset_after_every_single_byte_harms_nobody() {
+fn a_reset_after_any_byte_does_no_harm() {
     let mock = Mock::start();
     for port in [29999, 30002, 30004] {
         let words = talk(port);
@@ -179,16 +179,16 @@ fn a_reset_after_every_single_byte_harms_nobody() {
             let _ = s.write_all(&words[..n]);
             reset(s);
         }
-        mock.is_well();
+        mock.check_alive();
     }
 }
 
 #[test]
-fn slow_writers_and_clients_that_never_read_hold_up_nobody_and_cost_little() {
+fn slow_writers_and_clients_that_never_read_do_not_delay_others_and_cost_little() {
     let mock = Mock::start();
-    mock.is_well();
+    mock.check_alive();
     let before = mock.resident();
-    // Sixty clients: each writes a byte now and then and reads nothing, whatever is sent to it.
+    // Sixty clients: each writes a byte from time to time and never reads.
     let mut clients: Vec<(TcpStream, Vec<u8>, usize)> = (0..60)
         .map(|k| {
             let port = PORTS[k % 5];
@@ -209,19 +209,19 @@ fn slow_writers_and_clients_that_never_read_hold_up_nobody_and_cost_little() {
         }
         rounds += 1;
         if rounds % 30 == 0 {
-            mock.is_well();
+            mock.check_alive();
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-    mock.is_well();
+    mock.check_alive();
     let after = mock.resident();
     println!("60 clients that never read: {before} -> {after} KiB");
-    // Queues are bounded: a client costs its session and the kernel's buffers, never a growing backlog here.
+    // Queues are bounded: a client costs its session and the kernel's buffers.
     assert!(after < before + 60 * 512, "{before} KiB before, {after} KiB after");
 }
 
 #[test]
-fn lines_and_programs_without_an_end_are_cut_off() {
+fn clients_that_send_endless_lines_or_programs_are_disconnected() {
     let mock = Mock::start();
     let before = mock.resident();
     for (port, most) in [(29999u16, 1 << 20), (30002, 4 << 20), (mock.control, 4 << 20)] {
@@ -233,7 +233,7 @@ fn lines_and_programs_without_an_end_are_cut_off() {
             sent += block.len();
             assert!(sent < most + (8 << 20) && begin.elapsed() < Duration::from_secs(30), "{port}: takes {sent} bytes");
         }
-        mock.is_well();
+        mock.check_alive();
     }
     assert!(mock.resident() < before + 16_384, "{before} KiB before, {} KiB after", mock.resident());
 }

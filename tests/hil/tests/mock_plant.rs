@@ -1,5 +1,4 @@
-//! The mock's arm against the numbers that its documentation states (docs/MOCK-UR.md): what it may do, how it lags, what it reads, when
-//! it stops. Virtual clock: the same bits everywhere.
+//! The simulated arm against the figures in docs/MOCK-UR.md: limits, lag, encoders, stops. Virtual clock.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command, MessageKind, RuntimeState, SafetyMode, Setup, Upload};
@@ -8,14 +7,14 @@ use graspd_hil::plant::Model;
 use std::f64::consts::{PI, TAU};
 
 const DT: f64 = 0.002;
-/// Counts of an encoder a turn.
+/// Encoder counts per turn.
 const COUNTS: f64 = 1_048_576.0;
 
 fn arm() -> MockArm {
     MockArm::new(Setup::new(Model::by_name("ur5e").unwrap()), None)
 }
 
-/// An arm that runs a program of these lines.
+/// An arm that runs a program with this body.
 fn running(body: &str) -> MockArm {
     let mut a = arm();
     assert_eq!(a.upload(&format!("def t():\n{body}\nend\n")), Upload::Main);
@@ -57,7 +56,7 @@ fn targets_accelerate_as_asked_on_the_leading_joint_and_never_above_40() {
 
 #[test]
 fn drives_follow_within_80_rad_per_s2_and_lag_in_the_first_steps() {
-    // The steepest ramp there is: 40 rad/s2.
+    // The steepest ramp: 40 rad/s2.
     let mut a = forever("speedj([1.5, 0, 0, 0, 0, 0], 40, get_steptime())");
     let (mut lags, mut deviation, mut fastest) = (Vec::new(), 0.0f64, 0.0f64);
     for _ in 0..200 {
@@ -67,7 +66,7 @@ fn drives_follow_within_80_rad_per_s2_and_lag_in_the_first_steps() {
         deviation = deviation.max((t.target_q[0] - t.actual_q[0]).abs());
         fastest = fastest.max(t.actual_qd[0]);
         if t.target_qd[0] > 1e-9 && lags.len() < 3 {
-            // On a ramp, speed lag over acceleration is the lag in time.
+            // On a ramp the lag in time is the lag in speed divided by the acceleration.
             lags.push((t.target_qd[0] - t.actual_qd[0]) / 40.0 * 1e3);
         }
     }
@@ -80,7 +79,7 @@ fn drives_follow_within_80_rad_per_s2_and_lag_in_the_first_steps() {
     assert!(deviation < 3.5e-3, "{deviation}");
     assert!(fastest < 1.5 * 1.07, "{fastest}");
     assert!((a.robot().truth.actual_qd[0] - 1.5).abs() < 1e-4, "no lag at a constant speed");
-    // A slow velocity loop on command trails accordingly.
+    // The lag fault increases the lag accordingly.
     let mut a = forever("speedj([0.3, 0, 0, 0, 0, 0], 40, get_steptime())");
     a.command(Command::Lag { seconds: 0.1 }).unwrap();
     let reaches = |a: &mut MockArm| {
@@ -122,15 +121,15 @@ fn an_arm_that_leaves_its_path_by_5_degrees_is_stopped() {
         r.safety == SafetyMode::ProtectiveStop
     });
     assert!(stopped);
-    // It may be one step further than allowed when it is seen.
+    // The deviation may exceed the limit by one step when it is detected.
     assert!(worst > 0.087 - 1e-9 && worst < 0.087 + 0.5 * DT + 1e-3, "{worst}");
     assert_eq!(errors(&mut a), [153]);
     assert!(!a.robot().is_program_running());
 }
 
 #[test]
-fn joint_limits_stop_the_arm_before_they_are_passed() {
-    // The end of the range, at every speed: rest before 360 degrees.
+fn the_arm_stops_before_it_exceeds_joint_limits() {
+    // Position limit, at various speeds: the arm stops before 360 degrees.
     for rate in [0.3, 1.0, 2.5] {
         let mut a = forever(&format!("speedj([{rate}, 0, 0, 0, 0, 0], 20, get_steptime())"));
         a.robot_mut().teleport([TAU - 0.9, -1.57, 1.57, -1.57, -1.57, 0.0]);
@@ -140,7 +139,7 @@ fn joint_limits_stop_the_arm_before_they_are_passed() {
         assert!(q < TAU && q > TAU - 0.2, "{rate}: stopped at {q}");
         assert_eq!(errors(&mut a), [157]);
     }
-    // Faster than the joint may turn: 180 degrees a second.
+    // Speed limit: 180 degrees per second.
     let mut a = forever("speedj([0, 0, 0, 0, 3.3, 0], 40, get_steptime())");
     let mut fastest = 0.0f64;
     assert!(a.step_until(1.0, |r| {
@@ -198,9 +197,9 @@ fn the_slider_scales_every_motion_and_stretches_moves() {
         let t = &a.robot().truth;
         let speed = if joint == 6 { t.target_tcp_speed[2] } else { t.target_qd[joint] };
         assert!((speed - 0.25 * full).abs() < 1e-4 * full + 1e-6, "{call}: {speed}");
-        // What clients multiply: the limiter's share and the slider.
+        // Clients multiply the limiter's fraction and the slider.
         assert!((t.speed_scaling - 1.0).abs() < 1e-9 && (a.robot().slider - 0.25).abs() < 1e-12);
-        // The scaling itself moves by 5 a second, so that nothing jumps.
+        // The scaling changes by 5 per second at most.
         a.command(Command::SpeedSlider { fraction: 1.0 }).unwrap();
         a.step();
         assert!((a.robot().truth.speed_scaling - 0.26).abs() < 1e-9, "{}", a.robot().truth.speed_scaling);
@@ -221,7 +220,7 @@ fn the_slider_scales_every_motion_and_stretches_moves() {
     // 0.5 rad at 0.5 rad/s and 2 rad/s2: 1.25 s.
     assert!((one - 1.25).abs() < 0.02, "{one}");
     assert!((half / one - 2.0).abs() < 0.1, "{half} against {one}");
-    // At zero it waits, and goes on from there.
+    // At zero the arm waits; it continues when the slider is raised.
     let mut a = running("movej([0.5, -1.57, 1.57, -1.57, -1.57, 0], a=2, v=0.5)");
     a.step_until(0.4, |_| false);
     a.command(Command::SpeedSlider { fraction: 0.0 }).unwrap();
@@ -235,8 +234,8 @@ fn the_slider_scales_every_motion_and_stretches_moves() {
 }
 
 #[test]
-fn what_the_arm_carries_is_felt_in_the_joints() {
-    // A stretched-out arm: shoulder, elbow and wrist 1 hold the load, the base does not.
+fn the_payload_changes_the_joint_torques() {
+    // A stretched arm: shoulder, elbow and wrist 1 carry the load, the base does not.
     let at = |kg: f64| {
         let mut setup = Setup::new(Model::by_name("ur5e").unwrap());
         setup.start_joints = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
@@ -251,7 +250,7 @@ fn what_the_arm_carries_is_felt_in_the_joints() {
     let felt = (loaded[1] - empty[1]).abs();
     assert!((felt - expected).abs() < 0.15 * expected, "{felt} Nm, {expected} Nm by hand");
     assert!((loaded[0] - empty[0]).abs() < 1e-9);
-    // 2 kg for an arm of 5 kg, 50 kg for none: refused with the limit.
+    // 2 kg is within the payload of 5 kg; 50 kg is refused with the limit.
     let mut a = running("set_payload(50)");
     a.step();
     let told: Vec<_> = a.robot_mut().outbox.drain().map(|m| m.kind).collect();
@@ -262,11 +261,11 @@ fn what_the_arm_carries_is_felt_in_the_joints() {
 }
 
 #[test]
-fn a_brake_holds_and_power_takes_its_time() {
+fn brakes_hold_and_powering_on_takes_time() {
     let mut a = forever("speedj([0.5, 0, 0, 0, 0, 0], 4, get_steptime())");
     a.step_until(0.4, |_| false);
     a.command(Command::PowerOff).unwrap();
-    assert!(a.step_until(0.05, |r| r.at_rest()), "brakes stop the arm at once");
+    assert!(a.step_until(0.05, |r| r.at_rest()), "brakes stop the arm immediately");
     let q = a.robot().truth.actual_q;
     a.step_until(1.0, |_| false);
     assert_eq!(a.robot().truth.actual_q, q);

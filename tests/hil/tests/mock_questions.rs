@@ -1,4 +1,4 @@
-//! What a script may ask the controller besides motion: limits, contact, the past, temperatures; on the virtual clock.
+//! Query functions of scripts: limits, contact, joint history, temperatures. Virtual clock.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command, MessageKind, RuntimeState, Setup, Upload};
@@ -10,7 +10,7 @@ fn arm() -> MockArm {
 }
 
 /// Runs a program on the whole controller and returns what it logged.
-fn told(body: &str, orders: &[Command], seconds: f64) -> Vec<String> {
+fn messages(body: &str, orders: &[Command], seconds: f64) -> Vec<String> {
     let mut a = arm();
     a.step_until(0.1, |_| false);
     for order in orders {
@@ -51,18 +51,18 @@ fn questions_about_the_controller_are_answered() {
         ("make_list(3, 0.5)", "[0.5, 0.5, 0.5]"),
         ("wrench_trans(p[0, 0, 0.1, 0, 0, 0], [1, 0, 0, 0, 0, 0])", "[1, 0, 0, 0, -0.1, 0]"),
     ] {
-        assert_eq!(told(&format!("textmsg({expression})"), &[], 0.1), [expected], "{expression}");
+        assert_eq!(messages(&format!("textmsg({expression})"), &[], 0.1), [expected], "{expression}");
     }
-    assert!(told("get_joint_temp(6)", &[], 0.1)[0].starts_with("line 2: get_joint_temp"));
-    assert!(told("get_actual_joint_positions_history(-1)", &[], 0.1)[0].contains("steps"));
-    assert!(told("is_within_safety_limits(1)", &[], 0.1)[0].contains("six joints"));
-    let shown = told("set_flag(7, True)\ntextmsg(get_flag(7))", &[], 0.1);
+    assert!(messages("get_joint_temp(6)", &[], 0.1)[0].starts_with("line 2: get_joint_temp"));
+    assert!(messages("get_actual_joint_positions_history(-1)", &[], 0.1)[0].contains("steps"));
+    assert!(messages("is_within_safety_limits(1)", &[], 0.1)[0].contains("six joint positions"));
+    let shown = messages("set_flag(7, True)\ntextmsg(get_flag(7))", &[], 0.1);
     assert_eq!(shown, ["True"]);
 }
 
 #[test]
-fn contact_is_felt_and_the_way_back_is_remembered() {
-    // A force against the motion: found by its direction, with the steps since it began.
+fn contact_is_detected_and_the_joint_history_is_kept() {
+    // A force against the motion is detected by its direction; the result is the number of steps since it began.
     let push = |body: &str| {
         let mut a = arm();
         a.robot_mut().external_wrench = [-20.0, 0.0, 0.0, 0.0, 0.0, 0.0];
@@ -77,7 +77,7 @@ fn contact_is_felt_and_the_way_back_is_remembered() {
     assert_eq!(push(&reg("tool_contact()")), 10);
     assert_eq!(push(&reg("tool_contact(direction=[1, 0, 0, 0, 0, 0])")), 10);
     assert_eq!(push(&reg("tool_contact(direction=p[-1, 0, 0, 0, 0, 0])")), 0);
-    // Back along the joints' own way.
+    // The history contains the path backwards.
     let mut a = arm();
     a.upload("def t():\n  while True:\n    speedj([0.5, 0, 0, 0, 0, 0], 5, get_steptime())\n    write_output_float_register(0, get_actual_joint_positions_history(100)[0])\n  end\nend\n");
     let mut seen = Vec::new();

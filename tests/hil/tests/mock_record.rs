@@ -1,4 +1,4 @@
-//! The wire record, read by the table in docs/MOCK-UR.md and nothing else.
+//! The wire record, parsed according to the table in docs/MOCK-UR.md only.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command, Entry, Hosted, Setup, now_ns, read_record};
@@ -28,7 +28,7 @@ impl Bytes<'_> {
 }
 
 #[test]
-fn a_record_is_what_the_documentation_says() {
+fn a_record_has_the_documented_format() {
     let path = std::env::temp_dir().join(format!("graspd-record-{}-{}.rec", std::process::id(), now_ns()));
     let setup = Setup::new(Model::by_name("ur5e").unwrap());
     let mut mock = Hosted::start(setup, None, Some(path.clone())).unwrap();
@@ -42,7 +42,7 @@ fn a_record_is_what_the_documentation_says() {
     put(86, &[0, 2]);
     put(73, b"input_double_register_24,input_int_register_25");
     put(85, &[&[1][..], &0.25f64.to_be_bytes(), &77i32.to_be_bytes()].concat());
-    // Both answers are there, and with them everything before was dealt with.
+    // Both answers have arrived, so all earlier messages have been handled.
     s.read_exact(&mut [0; 4 + 3 + 13]).unwrap();
     let begin = std::time::Instant::now();
     while mock.ask(&Command::State).unwrap()["steps"].as_u64().unwrap() < 5 {
@@ -102,7 +102,7 @@ fn a_record_is_what_the_documentation_says() {
     for part in [" Rtde from ", "protective_stop", "stopped"] {
         assert!(notes.iter().any(|n| n.contains(part)), "{part}: {notes:?}");
     }
-    // And the reader that ships says the same.
+    // The library's reader agrees.
     assert_eq!(entries.len(), records);
     assert_eq!(entries.iter().filter(|e| matches!(e, Entry::Step { .. })).count(), steps);
 }

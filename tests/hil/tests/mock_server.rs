@@ -1,4 +1,4 @@
-//! The mock controller over real sockets: hostile clients, slow ones, a thousand of them, and one that dies in motion.
+//! The mock controller over real sockets: hostile clients, slow clients, a thousand reconnects, a client that dies in motion.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command, Entry, Hosted, Setup, judge_record, now_ns, read_record};
@@ -50,8 +50,8 @@ fn timestamp(s: &mut TcpStream) -> std::io::Result<f64> {
     }
 }
 
-/// The mock answers on every port.
-fn is_well(mock: &mut Hosted) {
+/// Checks that the control port and the dashboard answer.
+fn check_alive(mock: &mut Hosted) {
     assert_eq!(mock.ask(&Command::Ping).unwrap(), "done");
     let mut s = receiver(mock);
     let first = timestamp(&mut s).unwrap();
@@ -77,13 +77,13 @@ fn the_clock_has_no_gaps_and_several_clients_see_the_same() {
         steps.push(((now - last) / 0.002).round() as i64);
         last = now;
     }
-    // A stalled host makes up its steps and sends the newest only: never backwards, never twice.
+    // After a stall only the newest package is sent: time stamps never repeat or go back.
     assert!(steps.iter().all(|s| *s >= 1), "{steps:?}");
     assert!((timestamp(&mut b).unwrap() - last).abs() < 1.0);
 }
 
 #[test]
-fn hostile_bytes_end_their_own_connection_only() {
+fn hostile_bytes_only_end_their_own_connection() {
     let mut mock = host();
     let noise: Vec<u8> = (0..5000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
     let attacks: [&[u8]; 9] = [
@@ -100,26 +100,26 @@ fn hostile_bytes_end_their_own_connection_only() {
     for port in [29999, 30001, 30002, 30003, 30004] {
         for bytes in attacks {
             let mut s = mock.connect(port).unwrap();
-            // The other end may already have closed.
+            // The mock may already have closed the connection.
             let _ = s.write_all(bytes);
             drop(s);
         }
-        // Reset instead of an orderly end.
+        // RST instead of FIN.
         let mut s = mock.connect(port).unwrap();
         let _ = s.write_all(&[0, 200, 79, 1]);
         rustix::net::sockopt::set_socket_linger(&s, Some(Duration::ZERO)).unwrap();
         drop(s);
-        is_well(&mut mock);
+        check_alive(&mut mock);
     }
 }
 
 #[test]
-fn impossible_sizes_are_cut_off_at_once() {
+fn impossible_package_sizes_close_the_connection() {
     let mock = host();
     let mut s = mock.connect(30004).unwrap();
     s.write_all(&[0, 1, 86]).unwrap();
     let mut rest = Vec::new();
-    assert!(matches!(s.read_to_end(&mut rest), Ok(0)), "closed without a word");
+    assert!(matches!(s.read_to_end(&mut rest), Ok(0)), "closed without an answer");
 }
 
 #[test]
@@ -136,13 +136,13 @@ fn single_bytes_and_merged_packages_are_understood() {
     assert_eq!(read_package(&mut s).unwrap().0, 118);
     assert_eq!(read_package(&mut s).unwrap(), (79, b"\x01DOUBLE,INT32".to_vec()));
     assert_eq!(read_package(&mut s).unwrap(), (83, vec![1]));
-    // And the other way round: the mock itself sends single bytes.
+    // In the other direction the mock sends single bytes.
     mock.ask(&Command::Chunk { port: Default::default(), bytes: 1 }).unwrap();
     assert!(timestamp(&mut s).unwrap() > 60.0);
 }
 
 #[test]
-fn a_slow_writer_holds_up_nobody() {
+fn a_slow_writer_does_not_delay_others() {
     let mut mock = host();
     let slow: Vec<TcpStream> = (0..20)
         .map(|i| {
@@ -152,28 +152,28 @@ fn a_slow_writer_holds_up_nobody() {
         })
         .collect();
     let begin = Instant::now();
-    is_well(&mut mock);
+    check_alive(&mut mock);
     assert!(begin.elapsed() < Duration::from_secs(5));
     drop(slow);
 }
 
 #[test]
-fn a_thousand_reconnects_leave_no_trace() {
+fn a_thousand_reconnects_leak_nothing() {
     let mut mock = host();
-    is_well(&mut mock);
+    check_alive(&mut mock);
     std::thread::sleep(Duration::from_millis(50));
     let (files, tasks) = (open_files(), threads());
     for i in 0..1000 {
         let mut s = mock.connect([30004, 29999, 30001, 30003, 30002][i % 5]).unwrap();
         if i % 5 == 0 {
-            // Holds an input: the next owner must find it free.
+            // Owns an input, which must be free for the next client.
             let (kind, body) = ask(&mut s, 73, b"input_int_register_24");
             assert_eq!((kind, &body[1..]), (73, &b"INT32"[..]), "reconnect {i}");
         }
     }
-    is_well(&mut mock);
+    check_alive(&mut mock);
     let deadline = Instant::now() + Duration::from_secs(5);
-    // Other tests of this process open and close files too; only a growth that stays counts.
+    // Other tests of this process also open files; only permanent growth counts.
     while open_files() > files + 60 && Instant::now() < deadline {
         std::thread::sleep(Duration::from_millis(50));
     }
@@ -182,7 +182,7 @@ fn a_thousand_reconnects_leave_no_trace() {
 }
 
 #[test]
-fn a_client_that_does_not_read_is_cut_off_and_a_slow_one_gets_the_newest() {
+fn a_client_that_does_not_read_is_disconnected_and_a_slow_one_gets_the_newest_package() {
     let mut mock = host();
     let mut s = mock.connect(30004).unwrap();
     rustix::net::sockopt::set_socket_recv_buffer_size(&s, 4096).unwrap();
@@ -202,11 +202,11 @@ fn a_client_that_does_not_read_is_cut_off_and_a_slow_one_gets_the_newest() {
         }
     };
     assert!(ended, "the connection is still there after twelve seconds without a read");
-    is_well(&mut mock);
+    check_alive(&mut mock);
 }
 
 #[test]
-fn faults_of_the_wire_do_what_they_say() {
+fn network_faults_take_effect() {
     let mut mock = host();
     let mut s = receiver(&mock);
     let mut last = timestamp(&mut s).unwrap();
@@ -260,7 +260,7 @@ fn the_dashboard_and_the_primary_port_greet() {
     p.read_exact(&mut rest).unwrap();
     p.read_exact(&mut head).unwrap();
     assert_eq!(head[4], 16, "then the robot's state");
-    // A script error comes back with its line.
+    // A script error is reported with its line.
     let mut rest = vec![0; i32::from_be_bytes(head[..4].try_into().unwrap()) as usize - 5];
     p.read_exact(&mut rest).unwrap();
     p.write_all(b"def f():\n  x = 1\n  nonsense_call(x)\nend\n").unwrap();
@@ -287,7 +287,7 @@ end
 ";
 
 #[test]
-fn a_client_killed_in_motion_leaves_the_arm_at_rest_by_the_wire_record() {
+fn the_wire_record_shows_that_the_arm_stops_when_its_client_is_killed() {
     let path = std::env::temp_dir().join(format!("graspd-mock-{}-{}.rec", std::process::id(), now_ns()));
     let setup = Setup::new(Model::by_name("ur5e").unwrap());
     let mock = Hosted::start(setup, Some((0.5, 4.0)), Some(path.clone())).unwrap();
@@ -308,7 +308,7 @@ fn a_client_killed_in_motion_leaves_the_arm_at_rest_by_the_wire_record() {
             rate = (rate + 0.008).min(0.4);
             std::thread::sleep(Duration::from_millis(2));
         }
-        // SIGKILL closes the socket and nothing else happens.
+        // A killed process only closes its socket.
         drop(s);
         std::thread::sleep(Duration::from_millis(500));
     }
@@ -319,15 +319,15 @@ fn a_client_killed_in_motion_leaves_the_arm_at_rest_by_the_wire_record() {
     assert_eq!(summary.episode_count, 5, "{:?}", summary.episodes);
     assert_eq!(summary.limit_violations, 0, "{:?}", summary.violations);
     for e in &summary.episodes {
-        // 50 ms watchdog, ramp at 4 rad/s^2, the drives' lag; the host's own lateness on top, as the record's clock shows it.
+        // Watchdog of 50 ms, ramp of 4 rad/s^2, lag of the drives, and the delay of the host according to the record's clock.
         let late = record_lateness(&record);
         let bound = 0.050 + e.peak_rate / 4.0 + 0.030 + late;
         assert!(e.stop_ns().unwrap() as f64 * 1e-9 <= bound, "{e:?}, host late by {late}");
     }
-    assert_eq!(summary.inputs, world.judge.summary().inputs, "the record and the live oracle saw the same");
+    assert_eq!(summary.inputs, world.judge.summary().inputs, "the record and the live judge agree");
 }
 
-/// The longest pause between two control steps, s.
+/// The longest gap between two control steps, s.
 fn record_lateness(record: &[Entry]) -> f64 {
     let times: Vec<u64> = record
         .iter()

@@ -1,5 +1,5 @@
-//! The tracker against the simulated cell's own images, whose truth it is not told: acquisition at the start and before the
-//! valve, then tracking along the way.
+//! The tracker on rendered images, compared with ground truth: acquisition at the start and before the valve, tracking on the
+//! path.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::scenario::{Options, STANDOFF_M, Scenario};
@@ -20,7 +20,7 @@ fn off(truth: &Pose, found: &Pose) -> (f64, f64) {
 }
 
 #[test]
-fn the_gripper_is_found_and_followed_in_the_cells_images() {
+fn the_gripper_is_acquired_and_tracked_in_rendered_images() {
     let mut scratch = Box::new(AcquireScratch::new());
     for seed in 0..SEEDS {
         let cell = Scenario::from_seed(seed, &Options::default()).expect("a cell for this seed");
@@ -61,12 +61,12 @@ fn the_gripper_is_found_and_followed_in_the_cells_images() {
                     cycle.seed(a.left_from_gripper);
                 }
             }
-            // A tenth of a second a step: the way is walked at some centimetres a second.
+            // 0.1 s per step: some centimetres per second.
             let t = 1_000_000_000 + k * 100_000_000;
             let frame = StereoFrame { left, right, sequence: k + 1, capture_ns: [t; 2], now_ns: t + 20_000_000 };
-            // What the joints predict is a few millimetres and tenths of a degree off.
+            // The pose predicted from the joints has an error of a few millimetres and tenths of a degree.
             let wrong = exp_twist(&Vector6::new(0.002, -0.002, 0.003, 0.004, -0.003, 0.004));
-            let v = cycle.step(&frame, Some(truth * wrong)).expect("an honest frame");
+            let v = cycle.step(&frame, Some(truth * wrong)).expect("a valid frame");
             let (mm, deg) = off(&truth, &v.left_from_gripper);
             println!(
                 "seed {seed} step {k}: {:?} {:?}, {mm:.3} mm {deg:.3} deg, {:.3} px",

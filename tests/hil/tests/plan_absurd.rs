@@ -1,8 +1,9 @@
-//! Wrong and absurd selections on images: none may give a wrong answer that passes more often than 1 in 1,000, none may panic.
+//! Wrong and absurd selections: at most 1 in 1000 may give a wrong plan, and none may panic.
 //!
-//! A few hundred here; all of it: `GRASPD_SELECTIONS=10000 cargo test --release -p graspd-hil --test plan_absurd -- --nocapture`, and on other cells with
-//! `GRASPD_FIRST_SEED=1001` before it. `GRASPD_RIG_ERROR=0.5,0.1` gives a rig that is wrong by half a percent of focal length and 0.1 degrees: an
-//! answer is then right when it is what that rig makes of one of the scene's circles.
+//! A few hundred by default; the complete test is
+//! `GRASPD_SELECTIONS=10000 cargo test --release -p graspd-hil --test plan_absurd -- --nocapture`, on other cells with
+//! `GRASPD_FIRST_SEED=1001`. `GRASPD_RIG_ERROR=0.5,0.1` gives a rig with errors of 0.5 % of the focal length and 0.1 degrees: an
+//! answer is then correct if it is one of the scene's circles as reconstructed with that rig.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default, unreachable_pub, dead_code)] // a test; modules shared with an example
 
 #[path = "../examples/judge_cells/cell.rs"]
@@ -23,7 +24,7 @@ use graspd_rt::geom::{Pixel, Vec3, View};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// What is selected wrongly.
+/// Kinds of wrong selections.
 const KINDS: [&str; 8] = [
     "both clicks anywhere",
     "right click anywhere",
@@ -39,7 +40,7 @@ struct Cell {
     scenario: Scenario,
     images: [GreyImage; 2],
     circles: Vec<Circle>,
-    /// Centre and normal of every circle as it is, and as the given rig has it.
+    /// Centre and normal of every circle: ground truth, and as reconstructed with the given rig.
     places: Vec<[Vec3; 2]>,
 }
 
@@ -59,7 +60,8 @@ fn cell_of(seed: u64, options: &Options) -> Cell {
     Cell { scenario, images, circles, places }
 }
 
-/// Where a circle is, and where the best fit to its exact edges is when the given rig is believed. A bar's core has the bar's outlines for edges.
+/// A circle's true place, and that of the best fit to its exact edges with the given rig. The edges of a bar's core circle are the
+/// outlines of the bar.
 fn places(s: &Scenario, c: &Circle) -> Vec<[Vec3; 2]> {
     let w = &s.stage.wheel;
     let is_bar = c.name == "bar" || (c.name == "rim" && w.paint_width_m == 0.0);
@@ -76,7 +78,7 @@ fn places(s: &Scenario, c: &Circle) -> Vec<[Vec3; 2]> {
     [Some(shape), misled].into_iter().flatten().map(|s| [s.centre, s.normal]).collect()
 }
 
-/// Whether a plan's rim is one of the scene's circles: centre within 5 mm, normal within 3 degrees of where it is or where the rig has it.
+/// Whether a plan's rim is one of the scene's circles: centre within 5 mm and normal within 3 degrees of one of its places.
 fn is_there(p: &Plan, places: &[[Vec3; 2]]) -> bool {
     let rim = &p.reconstruction.rim;
     places.iter().any(|[centre, normal]| {
@@ -144,7 +146,7 @@ fn absurd_selections_give_no_wrong_answer() {
         let straight = Prepared::new([&c.images[0], &c.images[1]], &rig).unwrap();
         let exchanged = Prepared::new([&c.images[1], &c.images[0]], &rig).unwrap();
         for k in 0..each {
-            // An exchange is the same question however often it is asked: two of a kind in each cell.
+            // Exchanged images do not depend on random clicks: two selections of each kind per cell suffice.
             let kind = if k < 4 { 6 + k % 2 } else { k % 6 };
             let s = selections(kind, &c, &mut random);
             let p = if kind >= 6 { &exchanged } else { &straight };
@@ -180,6 +182,6 @@ fn absurd_selections_give_no_wrong_answer() {
     }
     let (n, bad) = (asked.iter().sum::<usize>(), wrong.iter().sum::<usize>());
     eprintln!("{bad} wrong of {n}");
-    // One is within chance's reach however few are asked.
+    // A single wrong plan is possible by chance even with few selections.
     assert!(bad <= 1.max(n / 1000), "{bad} wrong of {n}: {wrong:?}");
 }

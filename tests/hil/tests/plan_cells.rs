@@ -1,7 +1,8 @@
-//! The off-line stage on a few rendered cells of every kind, by every way of asking, with right and with wrong rigs: no wrong answer.
+//! The off-line stage on a few rendered cells of every kind, with every click and rim option, with correct and wrong rigs: no
+//! wrong answer.
 //!
-//! The whole table: `cargo run --release -p graspd-hil --example judge_cells`. `GRASPD_CELLS=20` judges more seeds of each kind here, and
-//! `GRASPD_FIRST_SEED=1001` others.
+//! Complete table: `cargo run --release -p graspd-hil --example judge_cells`. `GRASPD_CELLS=20` judges more seeds of each kind
+//! here, and `GRASPD_FIRST_SEED=1001` other ones.
 #![allow(clippy::unwrap_used, unreachable_pub, dead_code)] // a test; the modules serve the example as well
 
 #[path = "../examples/judge_cells/cell.rs"]
@@ -39,7 +40,8 @@ fn answers(error: RigError) -> Vec<Answer> {
     out
 }
 
-/// At most a share of the answers wrong, and of the questions that need no guess most answered with the rim that was meant.
+/// Checks that at most the fraction `most_wrong` of the answers is wrong, and that at least the fraction `least_right` of the
+/// unambiguous questions is answered with the selected rim.
 fn check(answers: &[Answer], most_wrong: f64, least_right: f64) {
     let wrong: Vec<_> = answers
         .iter()
@@ -58,7 +60,7 @@ fn check(answers: &[Answer], most_wrong: f64, least_right: f64) {
     );
 }
 
-/// The verdict on the same cell when its rim is said to be elsewhere.
+/// The verdict on the same cell with another ground truth of its rim.
 fn verdict(cell: &mut Cell, shape: Shape) -> Vec<&'static str> {
     let pixels = View::BOTH.map(|v| around(POINTS).filter_map(|a| cell.true_rig.project(v, &shape.point(a))).collect());
     cell.paint = Some(TrueRim { shape, pixels });
@@ -72,11 +74,11 @@ fn verdict(cell: &mut Cell, shape: Shape) -> Vec<&'static str> {
 }
 
 #[test]
-fn the_judge_tells_wrong_from_right_on_both_sides_of_its_limits() {
+fn the_judge_is_correct_on_both_sides_of_its_limits() {
     let mut cell = Cell::new(Kind::Ellipse, 41, Noise::Scene).unwrap();
     let truth = cell.paint.as_ref().unwrap().shape;
     assert_eq!(verdict(&mut cell, truth), [""; 0]);
-    // Across the sight line, where an answer is surest of itself, and by a millimetre and a little.
+    // Perpendicular to the viewing direction, where the stated covariance is smallest; less and more than 1 mm.
     let across = truth.centre.cross(&Vec3::y()).normalize();
     let mut beside = truth;
     beside.centre += across * 0.8e-3;
@@ -90,12 +92,12 @@ fn the_judge_tells_wrong_from_right_on_both_sides_of_its_limits() {
 }
 
 #[test]
-fn no_answer_is_wrong_with_a_right_rig() {
+fn no_answer_is_wrong_with_a_correct_rig() {
     check(&answers(RigError { focal_percent: 0.0, rotation_deg: 0.0 }), 0.0, 0.5);
 }
 
 #[test]
 fn few_answers_are_wrong_with_a_wrong_rig() {
-    // A share of the absolute depth is beyond what the reference calls unavoidable: one answer in six here, none of them by another rim.
+    // The error of the absolute depth exceeds the error floor in one answer of six here; none of them is another rim.
     check(&answers(RigError { focal_percent: 0.5, rotation_deg: 0.1 }), 0.17, 0.5);
 }

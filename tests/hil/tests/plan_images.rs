@@ -1,6 +1,7 @@
-//! The off-line stage on the simulator's images: from one click a view to the rim, against the truth.
+//! The off-line stage on rendered images: from one click per image to the rim, compared with ground truth.
 //!
-//! `GRASPD_WORLDS=100` runs more of each kind and prints the 95 % figures (the example `judge_cells` does the same by every click, choice of rim and rig error).
+//! `GRASPD_WORLDS=100` runs more worlds of each kind and prints the 95 % figures (the example `judge_cells` does the same for
+//! every click, rim option and rig error).
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::RigFile;
@@ -25,7 +26,7 @@ fn images(s: &Scenario, shot: &Snapshot) -> [GreyImage; 2] {
     })
 }
 
-/// Centre (millimetres) and normal (degrees) against a frame of the object whose origin may be shifted along its axis.
+/// Errors of centre (millimetres) and normal (degrees) relative to the object frame, shifted by `z` along its axis.
 fn errors(s: &Scenario, p: &Plan, z: f64) -> (f64, f64) {
     let truth: Pose = s.left_from_object();
     let centre = (truth * Point3::new(0.0, 0.0, z)).coords;
@@ -40,7 +41,7 @@ fn run(s: &Scenario, shot: &Snapshot, clicks: [Pixel; 2], rim: RimChoice) -> Res
     let pair = images(s, shot);
     let rig = RigFile::new(s.given_rig);
     let selections = clicks.map(Selection::Click);
-    // The wheel may be wider than the jaws; what is tested here is the rim.
+    // The wheel may be wider than the jaws, because only the rim is tested.
     let mut gripper = s.gripper.clone();
     gripper.opening[1] = 1.0;
     let found = plan([&pair[0], &pair[1]], [&selections[0], &selections[1]], &rig, &gripper, &options);
@@ -91,12 +92,12 @@ fn the_demo_worlds_are_planned_from_their_own_clicks() {
     assert_eq!(c.len() as u64, total, "every world has to be planned");
     let (c, n) = (percentile(&mut c, 0.95), percentile(&mut n, 0.95));
     eprintln!("demo worlds, 95 %: centre {c:.3} mm, normal {n:.3} degrees");
-    // What is left is the edge of the paint next to the bar's own limb, less than a pixel away where the rim turns from the camera.
+    // The remaining error is due to the silhouette of the bar, less than a pixel from the paint on the far side of the rim.
     assert!(c <= 0.3 && n <= 0.3, "{c} {n}");
 }
 
 #[test]
-fn a_painted_rim_with_a_third_hidden_is_found() {
+fn a_painted_rim_occluded_by_a_third_is_found() {
     let (mut c, mut n, mut r) = (Vec::new(), Vec::new(), Vec::new());
     let total = worlds(2);
     let options = Options {
@@ -128,7 +129,7 @@ fn a_painted_rim_with_a_third_hidden_is_found() {
 }
 
 #[test]
-fn a_bare_torus_is_a_round_bar_and_a_plane_edge_is_wrong_about_it() {
+fn a_bare_torus_is_reconstructed_as_a_round_bar_and_not_as_a_plane_edge() {
     let (mut c, mut n, mut flat) = (Vec::new(), Vec::new(), Vec::new());
     let total = worlds(2);
     let options = Options {
@@ -142,7 +143,7 @@ fn a_bare_torus_is_a_round_bar_and_a_plane_edge_is_wrong_about_it() {
     for seed in 1..=total {
         let s = Scenario::from_seed(seed, &options).unwrap();
         let shot = Snapshot { object_from_gripper: [None; 2], opening: 0.1, frame: 0, hidden_marks: 0 };
-        // A click near the outer outline: beside the bar's middle, away from the rim's centre.
+        // A click near the outer outline, farther from the rim's centre than the middle of the bar.
         let truth = s.left_from_object();
         let clicks = View::BOTH.map(|v| {
             let eye = s.true_rig.centre(v) - truth.translation.vector;
@@ -172,7 +173,7 @@ fn a_bare_torus_is_a_round_bar_and_a_plane_edge_is_wrong_about_it() {
             flat.push(e.1);
         }
     }
-    // A refusal is honest, but the exception.
+    // Refusals are allowed, but must be rare.
     assert!(c.len() as u64 * 10 >= total * 9, "{} of {total} planned", c.len());
     let (c, n) = (percentile(&mut c, 0.95), percentile(&mut n, 0.95));
     eprintln!("torus, 95 %: centre {c:.3} mm, normal {n:.3} degrees");

@@ -1,4 +1,5 @@
-//! The scene's images against its truth: drawn cells are usable, discs and circles lie where projection says, depth decides.
+//! Rendered images against ground truth: drawn cells are usable, discs and circles are at their projections, occlusion is
+//! correct.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::scenario::{Options, STANDOFF_M, Scenario, seen_marks};
@@ -33,7 +34,7 @@ fn drawn_cells_start_in_range_with_all_marks_in_view_and_differ() {
             let seen = seen_marks(&body, &s.true_rig, &(left * pose), 0.17, 10.0);
             assert!(seen.both >= least, "seed {seed}: {seen:?}");
         }
-        // The grasp it was drawn for is one: no error, and the axis is where it should be.
+        // The grasp for which the cell was drawn has no error.
         let flange = s.base_from_object * s.object_from_grasp(0.0) * s.gripper.gripper.flange_from_gripper.inverse();
         let q = graspd_rt::arm::inverse(&s.true_dh, &flange, &s.start).unwrap();
         let t = s.truth(&q, 0.0);
@@ -42,14 +43,14 @@ fn drawn_cells_start_in_range_with_all_marks_in_view_and_differ() {
         rigs.push(s.base_from_left.translation.vector);
     }
     for (i, a) in rigs.iter().enumerate() {
-        assert!(rigs[i + 1..].iter().all(|b| (a - b).norm() > 0.02), "two rigs in one place");
+        assert!(rigs[i + 1..].iter().all(|b| (a - b).norm() > 0.02), "two rigs at the same position");
     }
     let again = Scenario::from_seed(3, &Options::default()).unwrap();
     assert_eq!(again, Scenario::from_seed(3, &Options::default()).unwrap());
 }
 
 #[test]
-fn errors_asked_for_are_in_what_is_given_and_not_in_the_truth() {
+fn requested_errors_are_in_the_given_calibration_and_not_in_ground_truth() {
     let o = Options {
         kinematics_error_mm: 0.5,
         kinematics_error_deg: 0.1,
@@ -70,7 +71,7 @@ fn errors_asked_for_are_in_what_is_given_and_not_in_the_truth() {
 }
 
 #[test]
-fn a_world_written_is_the_world_read() {
+fn a_world_is_read_back_unchanged() {
     let dir = std::env::temp_dir().join(format!("graspd-world-{}", std::process::id()));
     let o = Options { kinematics_error_mm: 0.5, focal_error: 0.005, ..Default::default() };
     let s = Scenario::from_seed(8, &o).unwrap();
@@ -96,7 +97,7 @@ fn a_world_written_is_the_world_read() {
     std::fs::remove_dir_all(&dir).unwrap();
 }
 
-/// Centroid of darkness within `reach` pixels of a place, against the brightest grey there (the plate's).
+/// Centroid of the dark pixels within `reach` pixels of a position, relative to the brightest grey value there (the plate).
 fn centroid(p: &[u8], width: usize, at: Pixel, reach: f64) -> Pixel {
     let n = reach.ceil() as i64 + 1;
     let (x, y) = (at.x.round() as i64, at.y.round() as i64);
@@ -115,7 +116,7 @@ fn centroid(p: &[u8], width: usize, at: Pixel, reach: f64) -> Pixel {
     Pixel::new(u / m, v / m)
 }
 
-/// Centroid of a disc's image, by projecting many pieces of it, each weighed with the area it takes in the image.
+/// Centroid of a disc's image, from many projected pieces weighted by their area in the image.
 fn exact_centroid(camera: &Camera, centre: &Vec3, normal: &Vec3, radius: f64) -> Pixel {
     let u = normal.cross(&Vec3::new(0.3, 0.5, 0.8)).normalize();
     let v = normal.cross(&u);
@@ -136,7 +137,7 @@ fn exact_centroid(camera: &Camera, centre: &Vec3, normal: &Vec3, radius: f64) ->
     sum / m
 }
 
-/// Grey between pixels.
+/// Interpolated grey value.
 fn sample(p: &[u8], w: usize, q: Pixel) -> f64 {
     let (x, y) = (q.x.floor(), q.y.floor());
     let (fx, fy) = (q.x - x, q.y - y);
@@ -145,7 +146,7 @@ fn sample(p: &[u8], w: usize, q: Pixel) -> f64 {
 }
 
 #[test]
-fn discs_lie_where_projection_says() {
+fn discs_are_at_their_projections() {
     let s = Scenario::from_seed(2, &Options { clutter: 0, ..Default::default() }).unwrap();
     let mut r = renderer(&s);
     let (w, h) = r.size();
@@ -159,7 +160,7 @@ fn discs_lie_where_projection_says() {
             let centre = (view_from_object * pose * Point3::from(m.position)).coords;
             let normal = (view_from_object * pose).rotation * m.normal;
             let want = exact_centroid(camera, &centre, &normal, m.radius);
-            // Out to the end of the blur, short of the plate's border.
+            // Includes the blur, but not the border of the plate.
             let got = centroid(&p, w, want, m.radius * camera.fx / centre.z + 1.9);
             assert!((got - want).norm() < 0.03, "{view:?}: {got} {want}");
         }
@@ -167,8 +168,8 @@ fn discs_lie_where_projection_says() {
 }
 
 #[test]
-fn the_painted_circle_lies_where_projection_says() {
-    // A long lens, so that the edges of the paint stand apart from each other and from the bar's shading.
+fn the_painted_circle_is_at_its_projection() {
+    // A long focal length separates the edges of the paint from each other and from the shading of the bar.
     let o = Options { clutter: 0, focal_px: 3000.0, size: [800, 700], with_arm: false, ..Default::default() };
     let s = Scenario::from_seed(2, &o).unwrap();
     let mut r = renderer(&s);
@@ -211,7 +212,7 @@ fn the_painted_circle_lies_where_projection_says() {
 }
 
 #[test]
-fn the_valve_hides_what_is_behind_it_and_is_hidden_by_what_is_in_front() {
+fn valve_and_gripper_occlude_each_other_by_depth() {
     let s = Scenario::from_seed(4, &Options { clutter: 0, ..Default::default() }).unwrap();
     let mut r = renderer(&s);
     let (w, h) = r.size();
@@ -229,21 +230,21 @@ fn the_valve_hides_what_is_behind_it_and_is_hidden_by_what_is_in_front() {
         let q = camera.project(&(view_from_object * Point3::new(c * a.cos(), c * a.sin(), 0.0)).coords).unwrap();
         q.y.round() as usize * w + q.x.round() as usize
     };
-    // Far behind the wheel (pipe and wall have no depth of their own): the crest stays as it was.
+    // Far behind the wheel (pipe and wall have no depth): the crest is unchanged.
     let turn = s.object_from_grasp(0.0).rotation;
     let eye = (s.left_from_object().inverse() * Point3::origin()).coords.normalize();
     let p = draw(Some(Pose::from_parts((eye * -0.4).into(), turn)));
     let changed = (0..60).filter(|k| p[at_rim(*k)].abs_diff(empty[at_rim(*k)]) > 12).count();
     assert_eq!(changed, 0, "the crest must hide a gripper behind it");
     assert!(p.iter().zip(&empty).filter(|(a, b)| a.abs_diff(**b) > 20).count() > 3000, "the gripper itself must show");
-    // Between the camera and the wheel, on the line of sight: the crest is gone where the body is.
+    // Between the camera and the wheel: the body hides the crest.
     let p = draw(Some(Pose::from_parts((eye * 0.3).into(), turn)));
     let changed = (0..60).filter(|k| p[at_rim(*k)].abs_diff(empty[at_rim(*k)]) > 12).count();
     assert!(changed > 8, "{changed}");
 }
 
 #[test]
-fn images_repeat_with_their_number_and_noise_does_not() {
+fn equal_frame_numbers_give_equal_images_and_others_give_other_noise() {
     let o = Options { size: [320, 256], focal_px: 300.0, with_arm: false, ..Default::default() };
     let s = Scenario::from_seed(6, &o).unwrap();
     let mut v = ViewRenderer::new(&s.stage, s.true_rig.left, s.left_from_object(), s.sensor);

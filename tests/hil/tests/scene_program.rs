@@ -1,4 +1,4 @@
-//! `graspd-scene` as a process: frames over shared memory, the truth over a pipe, faults on command, an end with its parent.
+//! `graspd-scene` as a process: frames in shared memory, ground truth over a pipe, faults, end with its parent.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::scenario::{Options, Scenario};
@@ -58,7 +58,7 @@ impl Scene {
         serde_json::from_str(&answer).unwrap()
     }
 
-    /// Closes the pipe; the program must end by itself.
+    /// Closes the pipe; the program must exit.
     fn end(mut self) {
         drop(self.stdin);
         let until = Instant::now() + Duration::from_secs(10);
@@ -113,12 +113,12 @@ fn frames_truth_and_faults() {
         }
         seen >= 10
     }));
-    // Stamps lie on the camera's grid.
+    // Time stamps are on the camera's time grid.
     let period = 1_000_000_000 / 30;
     assert!(stamps.windows(2).all(|w| (w[1] - w[0]).is_multiple_of(period)), "{stamps:?}");
     assert_eq!(frames.stats().rejected_total(), 0, "{:?}", frames.stats());
 
-    // The truth of an arm at rest at its start is the scenario's own.
+    // Ground truth of an arm at rest at its start is that of the scenario.
     let scenario = Scenario::load(&scene.dir.join("world")).unwrap();
     let want = scenario.truth(&scenario.start, 0.0);
     let truth = scene.ask(r#"{"ask":"truth"}"#);
@@ -126,7 +126,7 @@ fn frames_truth_and_faults() {
     let standoff = truth["pregrasp"]["standoff_m"].as_f64().unwrap();
     assert!((standoff - graspd_hil::scenario::STANDOFF_M).abs() < 1e-12);
 
-    // Faults show as the refusal they are meant to cause, and go when cleared.
+    // Faults cause the intended frame error and end when cleared.
     for (fault, reject) in [
         (r#"{"fault":"skew","ms":8}"#, FrameError::Skew),
         (r#"{"fault":"swap","ids":true}"#, FrameError::Cameras),
@@ -142,7 +142,7 @@ fn frames_truth_and_faults() {
         assert_eq!(scene.ask(r#"{"clear":true}"#)["ok"], true);
         assert!(until(|| frames.newest(now_ns()).frame.is_some()), "{fault}: no recovery");
     }
-    // A frozen eye has the same pixels, a live one never.
+    // A frozen camera repeats its pixels, another one does not.
     assert_eq!(scene.ask(r#"{"fault":"freeze","eye":1}"#)["ok"], true);
     let mut prints: Vec<[u64; 2]> = Vec::new();
     assert!(until(|| {
@@ -171,9 +171,9 @@ fn bad_input_ends_with_the_documented_code_and_a_reason() {
     }
 }
 
-/// The options take numbers as their own help writes them.
+/// The options accept numbers in the form shown by the help.
 #[test]
-fn rows_of_numbers_are_taken_in_the_form_of_the_help() {
+fn lists_of_numbers_are_accepted_in_the_form_of_the_help() {
     let dir = std::env::temp_dir().join(format!("graspd-scene-args-{}", std::process::id()));
     let _ = std::fs::remove_dir_all(&dir);
     let make = |to: &str, extra: &[&str]| {
@@ -205,7 +205,7 @@ fn rows_of_numbers_are_taken_in_the_form_of_the_help() {
     std::fs::remove_dir_all(&dir).unwrap();
 }
 
-/// docs/SCENE.md names every fault, in a form that is taken.
+/// docs/SCENE.md lists every fault in a form that the program accepts.
 #[test]
 fn the_document_names_every_fault() {
     let text = include_str!("../../../docs/SCENE.md");

@@ -1,6 +1,5 @@
-//! What Universal Robots' C++ driver says to a controller, in its order, with a control script of the same make: RTDE with its recipes,
-//! the dashboard, the primary interface, and a script that connects back and is streamed to. Real sockets; every wait is bounded and no
-//! time is asserted from below.
+//! The communication of UR's C++ driver, in its order, with a similar control script: RTDE with its recipes, the dashboard, the
+//! primary interface, and a script that connects back and receives a stream. Real sockets; every wait is bounded.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command, Hosted, Setup};
@@ -11,7 +10,7 @@ use std::net::{TcpListener, TcpStream};
 use std::time::{Duration, Instant};
 
 const LIMIT: Duration = Duration::from_secs(30);
-/// How long the script waits for the next message: a host that stalls is not the robot's fault.
+/// Read timeout of the script, long enough for a stalled host.
 const PATIENCE_MS: i32 = 20_000;
 const START: [f64; 6] = [0.3, -1.4, 1.5, -1.2, -1.4, 0.2];
 
@@ -33,7 +32,7 @@ fn until(what: &str, mock: &mut Hosted, done: impl Fn(&Json) -> bool) {
     }
 }
 
-/// Prints what the robot says on the primary interface while a test runs: shown when it fails.
+/// Prints the robot's messages on the primary interface; shown when the test fails.
 fn overhear(mock: &Hosted) {
     let mut s = mock.connect(30001).unwrap();
     std::thread::spawn(move || {
@@ -115,7 +114,7 @@ fn send(s: &mut TcpStream, kind: u8, body: &[u8]) {
     s.write_all(&out).unwrap();
 }
 
-/// The answer to it; data in flight is passed over.
+/// The answer to a package; skips data packages in flight.
 fn answer(s: &mut TcpStream, kind: u8) -> Vec<u8> {
     loop {
         let mut head = [0; 3];
@@ -161,7 +160,7 @@ fn the_sessions_of_the_driver_are_served_in_its_order() {
     assert!(version);
     assert_eq!(model, Some(1), "a UR5");
 
-    // RTDE: its recipes, started, paused and started again at once.
+    // RTDE: its recipes, then start, pause and start again.
     let mut s = mock.connect(30004).unwrap();
     send(&mut s, 86, &[0, 2]);
     assert_eq!(answer(&mut s, 86), [1]);
@@ -195,8 +194,8 @@ fn the_sessions_of_the_driver_are_served_in_its_order() {
     let data = answer(&mut s, 85);
     assert_eq!(data.len(), 1 + types.split(',').map(size).sum::<usize>());
     let clock = f64::from_be_bytes(data[1..9].try_into().unwrap());
-    assert!(clock > 40.0, "a clock that is past its boot: the client does not wait");
-    // A second client of the same make is told whose the inputs are.
+    assert!(clock > 40.0, "controller time is past the boot phase, so that the client does not wait");
+    // A second client gets IN_USE for the same inputs.
     let mut other = mock.connect(30004).unwrap();
     send(&mut other, 86, &[0, 2]);
     assert_eq!(answer(&mut other, 86), [1]);
@@ -204,7 +203,7 @@ fn the_sessions_of_the_driver_are_served_in_its_order() {
     let refused = String::from_utf8(answer(&mut other, 73)[1..].to_vec()).unwrap();
     assert!(refused.split(',').all(|w| w == "IN_USE"), "{refused}");
 
-    // Dashboard: what it asks before it drives, one line for each.
+    // Dashboard: its queries, one line each.
     let mut d = BufReader::new(mock.connect(29999).unwrap());
     let mut line = String::new();
     d.read_line(&mut line).unwrap();
@@ -232,7 +231,7 @@ fn the_sessions_of_the_driver_are_served_in_its_order() {
     }
 }
 
-/// The PC's side of a running control script.
+/// The PC side of a running control script.
 struct Driver {
     reverse: TcpStream,
     path: TcpStream,
@@ -251,14 +250,14 @@ impl Driver {
             .replace("{{REVERSE_PORT}}", &port(&reverse))
             .replace("{{PATH_PORT}}", &port(&path))
             .replace("{{COMMAND_PORT}}", &port(&command));
-        // As in headless mode: whatever runs is stopped, then ours comes, with a line end after it.
+        // As in headless mode: stop the running program, then upload, with a final newline.
         let mut upload = mock.connect(30001).unwrap();
         upload.write_all(format!("stop program\n{text}\n").as_bytes()).unwrap();
         let (path, command, reverse) = (accept(&path), accept(&command), accept(&reverse));
         Driver { reverse, path, command }
     }
 
-    /// Streams until `done`, a message every two milliseconds.
+    /// Streams a message every 2 ms until `done`.
     fn stream(
         &mut self,
         mock: &mut Hosted,
@@ -279,15 +278,15 @@ impl Driver {
         }
     }
 
-    /// Keeps the script alive while a path is driven, until the script says how it ended.
+    /// Sends keep-alive messages until the script reports the result of a path.
     fn result(&mut self, mock: &mut Hosted) -> i32 {
         self.path.set_nonblocking(true).unwrap();
         let begin = Instant::now();
         let mut bytes = Vec::new();
         let mut buffer = [0; 4];
         while bytes.len() < 4 {
-            assert!(begin.elapsed() < LIMIT, "the path has no end: {}", state(mock));
-            // Neither a new path nor a cancel: the message only says that we live.
+            assert!(begin.elapsed() < LIMIT, "the path does not end: {}", state(mock));
+            // A keep-alive message: neither a new path nor a cancellation.
             self.reverse.write_all(&reverse(PATIENCE_MS, [0.0; 6], 3)).unwrap();
             match self.path.read(&mut buffer) {
                 Ok(0) => panic!("the script closed its path socket"),
@@ -313,7 +312,7 @@ impl Driver {
 }
 
 #[test]
-fn a_drivers_script_is_streamed_to_in_every_mode() {
+fn the_drivers_script_works_in_every_mode() {
     let mut mock = host();
     overhear(&mock);
     let mut d = Driver::start(&mock);
@@ -324,13 +323,13 @@ fn a_drivers_script_is_streamed_to_in_every_mode() {
     let before = state(&mut mock)["tcp_pose"][2].as_f64().unwrap();
     let z = |s: &Json| s["tcp_pose"][2].as_f64().unwrap();
     d.stream(&mut mock, "speedl", 4, [0.0, 0.0, 0.05, 0.0, 0.0, 0.0], |s| z(s) > before + 0.01);
-    // Idle: the thread of the mode before ends with a stop.
+    // Idle: the thread of the previous mode stops the arm.
     d.stream(&mut mock, "idle", 0, [0.0; 6], |s| s["at_rest"] == true);
     // Joint positions.
     let mut goal = six(&state(&mut mock), "actual_q");
     goal[0] -= 0.004;
     d.stream(&mut mock, "servoj", 1, goal, |s| near(six(s, "actual_q"), goal, 1e-3));
-    // A target that no arm can reach within a step is ignored, with a popup; the arm stays.
+    // A target that cannot be reached within a step is ignored with a popup.
     let mut far = goal;
     far[0] += 1.0;
     for _ in 0..20 {
@@ -344,7 +343,7 @@ fn a_drivers_script_is_streamed_to_in_every_mode() {
     let pose: [f64; 6] = std::array::from_fn(|i| here["tcp_pose"][i].as_f64().unwrap());
     d.stream(&mut mock, "pose", 5, pose, |s| s["at_rest"] == true);
     d.stream(&mut mock, "idle", 0, [0.0; 6], |s| s["at_rest"] == true);
-    // A path: joints, pose with a neighbour, straight line, and two pieces of spline that end at rest.
+    // A path: joints, pose with a start configuration, straight line, and two spline segments that end at rest.
     let q0 = six(&state(&mut mock), "actual_q");
     let with = |d: [f64; 6]| -> [f64; 6] { std::array::from_fn(|i| q0[i] + d[i]) };
     let (a, b, c) = (
@@ -363,7 +362,7 @@ fn a_drivers_script_is_streamed_to_in_every_mode() {
     assert_eq!(d.result(&mut mock), 0, "the path ends in success");
     let there = six(&state(&mut mock), "actual_q");
     assert!(near(there, c, 2e-3), "{there:?} {c:?}");
-    // One-shot commands beside it.
+    // Single commands in parallel.
     let mut payload = vec![1, 1_500_000, 0, 0, 50_000];
     payload.resize(28, 0);
     d.command.write_all(&words(&payload)).unwrap();
@@ -375,16 +374,20 @@ fn a_drivers_script_is_streamed_to_in_every_mode() {
     for kind in [0, 2, 3, 4, 5, 99] {
         let mut other = vec![kind];
         other.resize(28, 0);
+        if kind == 3 {
+            // Force mode of type 2 without compliant axes.
+            other[19] = 2_000_000;
+        }
         d.command.write_all(&words(&other)).unwrap();
     }
-    // A path that is given up half way.
+    // A path that is cancelled.
     d.send_path(&[point(with([-0.8, 0.0, 0.0, 0.0, 0.0, 0.0]), [0.0; 6], [0.05, 1.0, 0.0], 0.0, 0)]);
     until("the long way", &mut mock, |s| six(s, "target_qd")[0] < -0.04);
     d.reverse.write_all(&words(&[PATIENCE_MS, -1, 0, 0, 0, 0, 0, 3])).unwrap();
     assert_eq!(read_int(&mut d.path), 1, "canceled");
     until("rest", &mut mock, |s| s["at_rest"] == true);
     assert!(six(&state(&mut mock), "actual_q")[0] > c[0] - 0.9);
-    // Freedrive on and off, then the end in good order.
+    // Freedrive on and off, then a regular end.
     d.reverse.write_all(&words(&[PATIENCE_MS, 1, 0, 0, 0, 0, 0, 6])).unwrap();
     d.reverse.write_all(&words(&[PATIENCE_MS, -1, 0, 0, 0, 0, 0, 6])).unwrap();
     assert_eq!(state(&mut mock)["program_running"], true);
@@ -394,7 +397,7 @@ fn a_drivers_script_is_streamed_to_in_every_mode() {
 }
 
 #[test]
-fn a_driver_that_falls_silent_or_dies_ends_its_script_and_the_arm_rests() {
+fn the_script_ends_and_the_arm_stops_when_the_driver_is_silent_or_dies() {
     for dies in [false, true] {
         let mut mock = host();
         let mut d = Driver::start(&mock);
@@ -408,9 +411,9 @@ fn a_driver_that_falls_silent_or_dies_ends_its_script_and_the_arm_rests() {
     }
 }
 
-/// A program on the robot that fetches its text from the PC, as the External Control program node does.
+/// A program on the robot that requests its text from the PC, like the External Control program node.
 #[test]
-fn a_program_can_ask_the_pc_for_its_text() {
+fn a_program_can_request_its_text_from_the_pc() {
     let mut mock = host();
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -432,9 +435,9 @@ fn a_program_can_ask_the_pc_for_its_text() {
     until("the text", &mut mock, |s| s["output_int"][5] == "textmsg(1)\ntextmsg(2)\n".len() as i64);
 }
 
-/// Upload errors come back on the primary interface with their line.
+/// Upload errors are reported on the primary interface with their line.
 #[test]
-fn a_script_that_is_not_understood_fails_with_its_line_on_the_primary_port() {
+fn an_invalid_script_is_reported_with_its_line_on_the_primary_port() {
     let mut mock = host();
     let mut primary = mock.connect(30001).unwrap();
     for (text, line) in [

@@ -86,6 +86,20 @@ def moves(control, receive):
     check("stopJ stops", until(1, lambda: near(receive.getActualQd(), [0] * 6, 1e-3)))
 
 
+def forces(control, receive):
+    control.zeroFtSensor()
+    before = receive.getActualTCPPose()
+    wrench, limits = [0, 0, -10, 0, 0, 0], [0.1, 0.1, 0.05, 0.2, 0.2, 0.2]
+    stream(control, 0.6, lambda: control.forceMode([0] * 6, [0, 0, 1, 0, 0, 0], wrench, 2, limits))
+    control.forceModeStop()
+    dz = receive.getActualTCPPose()[2] - before[2]
+    check("forceMode moves the free arm at its limit", -0.06 < dz < -0.01, str(dz))
+    check("forceModeStop stops", until(1, lambda: near(receive.getActualQd(), [0] * 6, 1e-3)))
+    waypoint = control.getTargetWaypoint()
+    check("getTargetWaypoint", len(waypoint) == 6 and all(map(math.isfinite, waypoint)), str(waypoint))
+    check("the script still runs", control.isProgramRunning())
+
+
 def streams(control, receive):
     stream(control, 0.6, lambda: control.speedJ([0.2, 0, 0, 0, 0, -0.1], 1.0, 0.002))
     qd = receive.getActualQd()
@@ -134,6 +148,7 @@ def main():
     control = rtde_control.RTDEControlInterface(ADDRESS)
     check("control: its script runs", control.isProgramRunning())
     moves(control, receive)
+    forces(control, receive)
     streams(control, receive)
     watchdog_and_reconnect(control, receive)
     control.disconnect()

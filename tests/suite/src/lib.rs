@@ -1,1 +1,1 @@
-//! Helpers shared by the end-to-end tests.
+//! End-to-end tests of graspd against third-party clients, and the tests of the source layout.

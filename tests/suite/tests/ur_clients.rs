@@ -1,5 +1,5 @@
-//! Other people's clients against the mock controller, as published on PyPI: SDU's ur_rtde; Universal Robots' own Python RTDE client in
-//! two editions, as two packages carry it; a dashboard client and one that sends bare script lines. And a plain Python client.
+//! Third-party clients from PyPI against the mock controller: SDU's ur_rtde, UR's own Python RTDE client as contained in two
+//! packages, a dashboard client, and a client that sends single script lines. In addition a client in plain Python.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command as Order, Hosted, Setup};
@@ -8,9 +8,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
-/// The clients, in the versions that the mock is held to.
+/// The clients and their versions.
 const WHEELS: [&str; 5] = ["ur_rtde==1.6.5", "URsocket==0.2", "urpy==1.2.0", "ur-remote==0.1.3", "ur-aj==0.1.5"];
-/// Whether all of them are there, without running any of their code but SDU's.
+/// Checks that all are installed; imports only SDU's code.
 const PROBE: &str = "import rtde_control, rtde_receive, rtde_io; from importlib.util import find_spec as f; \
     assert f('URsocket') and f('urpy') and f('ur_remote') and f('ur_aj')";
 
@@ -22,7 +22,7 @@ fn is_ci() -> bool {
     std::env::var("CI").is_ok_and(|v| v == "true" || v == "1")
 }
 
-/// Says at the top of its voice that a test was not run; in CI it fails instead.
+/// Reports a skipped test prominently; in CI it fails instead.
 fn skip(reason: &str) {
     assert!(!is_ci(), "{reason}: in CI this test must run");
     eprintln!("\n********************************************************************");
@@ -30,7 +30,7 @@ fn skip(reason: &str) {
     eprintln!("********************************************************************\n");
 }
 
-/// Runs a command, at most so long; its output goes to this test's.
+/// Runs a command with a time limit; inherits standard output and error.
 fn run(command: &mut Command, limit: Duration) -> Result<ExitStatus, String> {
     let mut child = command.stdin(Stdio::null()).spawn().map_err(|e| format!("{command:?}: {e}"))?;
     let begin = Instant::now();
@@ -48,7 +48,7 @@ fn run(command: &mut Command, limit: Duration) -> Result<ExitStatus, String> {
     }
 }
 
-/// A Python of its own with the wheels, made once and kept in the target directory. Tests of this process share it.
+/// A Python environment with the clients, created once in the target directory and shared by the tests of this process.
 fn python_with_wheels() -> Result<PathBuf, String> {
     static MADE: std::sync::Mutex<Option<Result<PathBuf, String>>> = std::sync::Mutex::new(None);
     MADE.lock().unwrap().get_or_insert_with(make_python).clone()
@@ -70,10 +70,10 @@ fn make_python() -> Result<PathBuf, String> {
         return Err("python3 -m venv failed".to_owned());
     }
     let mut pip = Command::new(&python);
-    // Without what they say they need: the parts that are used need nothing.
+    // Without dependencies: the parts that are used need none.
     pip.args(["-m", "pip", "install", "--quiet", "--no-deps", "--only-binary", ":all:"]).args(WHEELS);
     run(&mut pip, Duration::from_secs(300))?;
-    let reason = || format!("{WHEELS:?} could not be installed; is PyPI out of reach?");
+    let reason = || format!("{WHEELS:?} could not be installed; is PyPI reachable?");
     if has_wheel(&python) { Ok(python) } else { Err(reason()) }
 }
 
@@ -84,7 +84,7 @@ fn mock() -> Hosted {
 }
 
 #[test]
-fn sdus_receive_io_and_control_interfaces_drive_the_mock_unmodified() {
+fn sdus_receive_io_and_control_interfaces_work_unmodified() {
     let python = match python_with_wheels() {
         Ok(python) => python,
         Err(reason) => return skip(&reason),
@@ -96,7 +96,7 @@ fn sdus_receive_io_and_control_interfaces_drive_the_mock_unmodified() {
     let status = run(&mut command, Duration::from_secs(120)).unwrap();
     let state = mock.ask(&Order::State).unwrap();
     assert!(status.success(), "{status}; the mock's state: {state}");
-    // What its I/O interface wrote last is still there.
+    // The values written last by its I/O interface.
     assert_eq!(state["input_int"][19], 1234);
     assert_eq!(state["input_double"][19], -2.5);
     let seen = mock.ask(&Order::Summary).unwrap();
@@ -104,7 +104,7 @@ fn sdus_receive_io_and_control_interfaces_drive_the_mock_unmodified() {
 }
 
 #[test]
-fn clients_from_pypi_find_a_robot() {
+fn further_clients_from_pypi_work() {
     let python = match python_with_wheels() {
         Ok(python) => python,
         Err(reason) => return skip(&reason),
@@ -119,7 +119,7 @@ fn clients_from_pypi_find_a_robot() {
 }
 
 #[test]
-fn a_plain_python_client_finds_everything_as_described() {
+fn a_plain_python_client_works() {
     if Command::new("python3").arg("--version").stdout(Stdio::null()).status().is_err() {
         return skip("there is no python3");
     }

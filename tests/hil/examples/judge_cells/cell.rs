@@ -1,4 +1,4 @@
-//! A cell to be judged on: two images, the true rims in them, places where an operator clicks, and the rig with any error.
+//! A cell for judging: two images, the true rims in them, clicks of an operator, and the rig with any error.
 
 use crate::reference::{POINTS, Shape, around};
 use graspd_calib::files::GripperFile;
@@ -14,12 +14,13 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
 use std::f64::consts::TAU;
 
-/// How far a hand misses along each axis at most, pixels: what the scenario's own clicks have.
-const HAND_PX: f64 = 1.2;
-/// To either side of an outline a click needs the bar and what is behind it: as far as the hand may miss.
-const CLEAR_PX: f64 = 2.0;
-/// A point is hidden by what is nearer to the eye by this much, metres: more than a grazing ray's first touch of the bar.
-const NEARER_M: f64 = 1e-3;
+/// Largest error of a click along each axis, pixels; that of the scenario's own clicks.
+const MAX_CLICK_ERROR_PX: f64 = 1.2;
+/// Distance to either side of an outline at which a click needs the bar and its background, pixels; above the click error.
+const CLEARANCE_PX: f64 = 2.0;
+/// A surface occludes a point if it is nearer to the camera by this much, metres; above the distance at which a grazing ray
+/// first hits the bar.
+const MIN_OCCLUSION_M: f64 = 1e-3;
 /// JPEG quality of the round trip.
 const JPEG_QUALITY: u8 = 85;
 
@@ -27,17 +28,17 @@ const JPEG_QUALITY: u8 = 85;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Kind {
-    /// A painted circle of 75 mm on a bar, 30 % of it hidden.
+    /// A painted circle of 75 mm on a bar, 30 % occluded.
     Paint,
-    /// The same on a thinner bar, whose limb comes next to the paint.
+    /// The same on a thinner bar, whose silhouette is close to the paint.
     Thin,
     /// A bare wheel of any size.
     Torus,
-    /// A painted ellipse on a board, from a renderer of its own.
+    /// A painted ellipse on a board, from a separate renderer.
     Ellipse,
 }
 
-/// Where the operator clicks.
+/// Place of the operator's click.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Click {
@@ -49,20 +50,20 @@ pub enum Click {
     Inner,
 }
 
-/// The noise of the images.
+/// Image noise.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Noise {
-    /// The renderers' own: read and photon noise of the scene, 2 grey values for ellipses.
+    /// That of the renderers: read and photon noise of the scene, 2 grey values for ellipses.
     Scene,
     /// 2.5 grey values everywhere.
     Gaussian,
-    /// Variance 1 plus a twentieth of the grey value.
+    /// Variance of 1 plus a twentieth of the grey value.
     Poisson,
-    /// The renderers' own, then a JPEG round trip at quality 85.
+    /// That of the renderers, then a JPEG round trip at quality 85.
     Jpeg,
 }
 
-/// The error of the rig as given: both focal lengths, percent, and the relative rotation, degrees; each with a direction drawn by the seed.
+/// Error of the given rig: both focal lengths, percent, and the relative rotation, degrees; the seed determines sign and axis.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RigError {
     /// Of the focal lengths, percent.
@@ -72,16 +73,18 @@ pub struct RigError {
 }
 
 impl RigError {
-    /// Reads `0`, `0.5:0.1` or `0.5,0.1`.
+    /// Parses `0`, `0.5:0.1` or `0.5,0.1`.
     pub fn parse(text: &str) -> Result<Self, String> {
-        let bad = || format!("rig error {text:?}: give percent of focal length and degrees of rotation, like 0.5:0.1");
+        let bad = || {
+            format!("rig error {text:?}: expected percent of focal length and degrees of rotation, for example 0.5:0.1")
+        };
         let (f, r) = text.split_once([':', ',']).unwrap_or((text, "0"));
         let number = |s: &str| s.trim().parse::<f64>().ok().filter(|v| v.is_finite()).ok_or_else(bad);
         let e = Self { focal_percent: number(f)?, rotation_deg: number(r)? };
         if text.contains([':', ',']) || e.focal_percent == 0.0 { Ok(e) } else { Err(bad()) }
     }
 
-    /// As scenario options have it.
+    /// Scenario options with this error.
     pub fn applied(&self, o: &Options) -> Options {
         Options { focal_error: self.focal_percent / 100.0, rotation_error_deg: self.rotation_deg, ..*o }
     }
@@ -93,7 +96,7 @@ impl std::fmt::Display for RigError {
     }
 }
 
-/// A rim that is there, and the exact raw pixels of its edges that are seen.
+/// A rim of the cell, and the exact raw pixels of its visible edges.
 #[derive(Clone, Debug)]
 pub struct TrueRim {
     /// The rim.
@@ -104,15 +107,15 @@ pub struct TrueRim {
 
 /// A cell with its images.
 pub struct Cell {
-    /// What it is.
+    /// Kind of cell.
     pub kind: Kind,
-    /// What it was drawn from.
+    /// Its seed.
     pub seed: u64,
     /// Left and right image.
     pub images: [GreyImage; 2],
-    /// The cameras as they are.
+    /// True cameras.
     pub true_rig: Rig,
-    /// The gripper, its jaws wide enough for any wheel: what is judged is the rim.
+    /// The gripper, its jaws wide enough for any wheel, because only the rim is judged.
     pub gripper: GripperFile,
     /// The painted circle or ellipse.
     pub paint: Option<TrueRim>,
@@ -136,7 +139,7 @@ impl Kind {
                 tilt_deg: [15.0, 60.0],
                 ..alone
             },
-            // Rig and place of a wheel as wide as the ellipse may be, which takes its place.
+            // Rig and pose of a wheel of the ellipse's size, which the ellipse replaces.
             Self::Ellipse => {
                 Options { core_radius_m: [0.06, 0.09], paint_width_m: 0.0, tilt_deg: [6.0, 34.0], ..alone }
             }
@@ -145,7 +148,7 @@ impl Kind {
 }
 
 impl Cell {
-    /// Draws and renders a cell; the same kind, seed and noise give the same cell.
+    /// Draws and renders a cell; equal kind, seed and noise give equal cells.
     pub fn new(kind: Kind, seed: u64, noise: Noise) -> Result<Self, String> {
         let mut options = kind.options();
         if matches!(noise, Noise::Gaussian | Noise::Poisson) {
@@ -168,7 +171,7 @@ impl Cell {
             grey = View::BOTH.map(|v| ellipse_image(&s, v, &shape, noise, &mut rng));
             let rim = TrueRim { shape, pixels: seen_pixels(&s, &shape) };
             clicks[Click::Paint as usize] =
-                Some(View::BOTH.map(|v| hand(*pick(&rim.pixels[v.index()], &mut rng), &mut rng)));
+                Some(View::BOTH.map(|v| click_near(*pick(&rim.pixels[v.index()], &mut rng), &mut rng)));
             paint = Some(rim);
         } else {
             let w = &s.stage.wheel;
@@ -193,13 +196,13 @@ impl Cell {
         let mut images = Vec::new();
         for g in grey {
             let g = if noise == Noise::Jpeg { through_jpeg(&g, w as u32, h as u32)? } else { g };
-            images.push(GreyImage::new(w, h, g).ok_or("the image has not the camera's size")?);
+            images.push(GreyImage::new(w, h, g).ok_or("image size mismatch with the camera")?);
         }
         let images: [GreyImage; 2] = images.try_into().map_err(|_| "two views, two images")?;
         Ok(Self { kind, seed, images, true_rig: s.true_rig, gripper, paint, bar, clicks, options })
     }
 
-    /// The rig as given, wrong by an error: the scenario's own way of misleading.
+    /// The given rig with an error, as the scenario applies it.
     pub fn given(&self, error: &RigError) -> Result<Rig, String> {
         let s = Scenario::from_seed(self.seed, &error.applied(&self.options)).map_err(|e| e.to_string())?;
         if s.true_rig != self.true_rig {
@@ -208,7 +211,7 @@ impl Cell {
         Ok(s.given_rig)
     }
 
-    /// Where the operator clicks in both images; `None` where this cell has no such place.
+    /// The operator's click in both images; `None` if this cell has no such place.
     pub fn click(&self, click: Click) -> Option<[Pixel; 2]> {
         self.clicks[click as usize]
     }
@@ -218,62 +221,65 @@ fn pick<'a, T>(from: &'a [T], rng: &mut impl Rng) -> &'a T {
     &from[rng.random_range(0..from.len())]
 }
 
-/// A place as a hand hits it.
-fn hand(at: Pixel, rng: &mut impl Rng) -> Pixel {
-    at + Pixel::new(rng.random_range(-HAND_PX..HAND_PX), rng.random_range(-HAND_PX..HAND_PX))
+/// A click with the operator's error.
+fn click_near(at: Pixel, rng: &mut impl Rng) -> Pixel {
+    at + Pixel::new(
+        rng.random_range(-MAX_CLICK_ERROR_PX..MAX_CLICK_ERROR_PX),
+        rng.random_range(-MAX_CLICK_ERROR_PX..MAX_CLICK_ERROR_PX),
+    )
 }
 
-/// An eye and a direction in the object's frame.
+/// Camera centre and viewing direction of a pixel in the object frame.
 fn object_ray(s: &Scenario, view: View, pixel: Pixel) -> Option<(Vec3, Vec3)> {
     let to_object = s.left_from_object().inverse();
     let way = s.true_rig.view_from_left(view).inverse().rotation * s.true_rig.camera(view).ray(pixel)?;
     Some(((to_object * Point3::from(s.true_rig.centre(view))).coords, to_object.rotation * way))
 }
 
-/// Whether nothing of the wheel stands before a point of it.
+/// Whether the wheel does not occlude a point of its own.
 fn is_seen(s: &Scenario, view: View, x: &Vec3) -> bool {
     let to_object = s.left_from_object().inverse();
-    let eye = (to_object * Point3::from(s.true_rig.centre(view))).coords;
-    let to = (to_object * Point3::from(*x)).coords - eye;
-    s.stage.wheel.trace(&eye, &to.normalize()).is_none_or(|(t, _, _)| t > to.norm() - NEARER_M)
+    let camera_centre = (to_object * Point3::from(s.true_rig.centre(view))).coords;
+    let to = (to_object * Point3::from(*x)).coords - camera_centre;
+    s.stage.wheel.trace(&camera_centre, &to.normalize()).is_none_or(|(t, _, _)| t > to.norm() - MIN_OCCLUSION_M)
 }
 
-/// Exact raw pixels of what a view sees of a rim's edges.
+/// Exact raw pixels of the visible edges of a rim in both images.
 fn seen_pixels(s: &Scenario, shape: &Shape) -> [Vec<Pixel>; 2] {
     let plain = s.stage.wheel.paint_width_m == 0.0 && shape.bar.is_none();
     View::BOTH.map(|view| {
-        let eye = s.true_rig.centre(view);
+        let camera_centre = s.true_rig.centre(view);
         let points: Vec<Vec3> = match shape.bar {
             None => around(POINTS).map(|a| shape.point(a)).collect(),
-            Some(_) => around(POINTS / 2).filter_map(|a| shape.outlines(&eye, a)).flatten().collect(),
+            Some(_) => around(POINTS / 2).filter_map(|a| shape.outlines(&camera_centre, a)).flatten().collect(),
         };
-        // The board of an ellipse stands alone: the wheel whose place it took hides nothing.
+        // The board of an ellipse has no wheel that could occlude it.
         let seen = points.iter().filter(|x| plain || is_seen(s, view, x));
         seen.filter_map(|x| s.true_rig.project(view, x)).collect()
     })
 }
 
-/// A click on a visible piece of the bar's outer (0) or inner (1) outline, with bar on one side and none of the wheel on the other.
+/// A click on a visible part of the bar's outer (0) or inner (1) outline, with the bar on one side and background on the other.
 fn silhouette_click(s: &Scenario, core: &Shape, view: View, side: usize, rng: &mut impl Rng) -> Option<Pixel> {
-    let eye = s.true_rig.centre(view);
+    let camera_centre = s.true_rig.centre(view);
     for _ in 0..400 {
         let angle = rng.random_range(0.0..TAU);
-        let edge = core.outlines(&eye, angle)?[side];
+        let edge = core.outlines(&camera_centre, angle)?[side];
         let Some(at) = s.true_rig.project(view, &edge) else { continue };
         let Some(middle) = s.true_rig.project(view, &core.point(angle)) else { continue };
         let Some(out) = (at - middle).try_normalize(1e-9) else { continue };
         let meets =
             |p: Pixel| object_ray(s, view, p).map(|(o, d)| s.stage.wheel.trace(&o, &d).map(|(_, part, _)| part));
-        let (inside, outside) = (meets(at - out * CLEAR_PX), meets(at + out * CLEAR_PX));
+        let (inside, outside) = (meets(at - out * CLEARANCE_PX), meets(at + out * CLEARANCE_PX));
         let in_image = s.true_rig.camera(view).contains(at, 10.0);
         if in_image && inside == Some(Some(Part::Rim)) && outside == Some(None) && is_seen(s, view, &edge) {
-            return Some(hand(at, rng));
+            return Some(click_near(at, rng));
         }
     }
     None
 }
 
-/// Adds noise to a clean image where it is not the renderer's own.
+/// Adds noise to an image that was rendered without noise.
 fn with_noise(mut grey: Vec<u8>, noise: Noise, rng: &mut impl Rng) -> Vec<u8> {
     if matches!(noise, Noise::Gaussian | Noise::Poisson) {
         for g in &mut grey {
@@ -302,17 +308,18 @@ fn through_jpeg(grey: &[u8], w: u32, h: u32) -> Result<Vec<u8>, String> {
     Ok(DynamicImage::from_decoder(decoder).map_err(|e| e.to_string())?.into_luma8().into_raw())
 }
 
-/// A painted ellipse on a darker board that fills the view: area coverage on 4 x 4 places a pixel, then the lens's blur.
+/// A painted ellipse on a darker board that fills the view: area coverage from 4 x 4 samples per pixel, then the lens's blur.
 fn ellipse_image(s: &Scenario, view: View, shape: &Shape, noise: Noise, rng: &mut ChaCha8Rng) -> Vec<u8> {
     const FINE: usize = 4;
     let camera = s.true_rig.camera(view);
     let (w, h) = (camera.width as usize, camera.height as usize);
     let left_from_view: Pose = s.true_rig.view_from_left(view).inverse();
-    let eye = s.true_rig.centre(view);
+    let camera_centre = s.true_rig.centre(view);
     let axis_b = shape.normal.cross(&shape.axis_a);
     let inside = |p: Pixel| {
         let Some(way) = camera.ray(p).map(|d| left_from_view.rotation * d) else { return false };
-        let x = eye + way * ((shape.centre - eye).dot(&shape.normal) / way.dot(&shape.normal)) - shape.centre;
+        let x = camera_centre + way * ((shape.centre - camera_centre).dot(&shape.normal) / way.dot(&shape.normal))
+            - shape.centre;
         (x.dot(&shape.axis_a) / shape.axes[0]).hypot(x.dot(&axis_b) / shape.axes[1]) < 1.0
     };
     let outline: Vec<Pixel> = around(720).filter_map(|a| s.true_rig.project(view, &shape.point(a))).collect();

@@ -13,24 +13,24 @@ use nalgebra::{Matrix5, Vector2, Vector5};
 use rustix::time::{ClockId, clock_gettime};
 use serde::Serialize;
 
-/// Centre beyond this and the rig's unavoidable share: wrong. Millimetres.
-const CENTRE_MM: f64 = 1.0;
-/// The same for the normal, degrees.
-const NORMAL_DEG: f64 = 0.5;
-/// The same for the radius of a bar, millimetres.
-const BAR_MM: f64 = 1.0;
-/// 99.9 % of chi-squared with 5 degrees of freedom: centre and normal.
+/// Largest error of the centre above the error floor of the rig, millimetres.
+const MAX_CENTRE_MM: f64 = 1.0;
+/// Largest error of the normal above the error floor of the rig, degrees.
+const MAX_NORMAL_DEG: f64 = 0.5;
+/// Largest error of a bar's radius above the error floor of the rig, millimetres.
+const MAX_BAR_MM: f64 = 1.0;
+/// 99.9 % quantile of chi-squared with 5 degrees of freedom: centre and normal.
 const REGION_999: f64 = 20.515;
-/// 95 % of chi-squared with 3 degrees of freedom: centre.
+/// 95 % quantile of chi-squared with 3 degrees of freedom: centre.
 pub const CENTRE_95: f64 = 7.815;
-/// 95 % of chi-squared with 2 degrees of freedom: normal.
+/// 95 % quantile of chi-squared with 2 degrees of freedom: normal.
 pub const NORMAL_95: f64 = 5.991;
 
-/// What the operator says about the rim.
+/// The operator's rim option.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum RimAsk {
-    /// Nothing.
+    /// No option.
     Auto,
     /// A plane edge.
     Edge,
@@ -45,11 +45,11 @@ pub enum RimAsk {
 /// The task's tolerance (one sigma) and the rig's stated calibration error, as on the command line.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Asked {
-    /// Of the centre, millimetres.
+    /// Tolerance of the centre, millimetres.
     pub tolerance_mm: f64,
-    /// Of the normal, degrees.
+    /// Tolerance of the normal, degrees.
     pub tolerance_deg: f64,
-    /// Allowance for the calibration, pixels; `None` for the default.
+    /// Stated calibration error, pixels; `None` for the default.
     pub calibration_px: Option<f64>,
 }
 
@@ -66,25 +66,25 @@ pub struct Answer {
     pub kind: Kind,
     /// Its seed.
     pub seed: u64,
-    /// Error of the rig as given.
+    /// Error of the given rig.
     pub rig_error: String,
-    /// Where was clicked.
+    /// Place of the click.
     pub click: Click,
-    /// What was said.
+    /// Rim option.
     pub rim: RimAsk,
-    /// Processor time from the images to the answer, one thread, milliseconds.
+    /// Processor time of one thread from the images to the answer, milliseconds.
     pub ms: f64,
     /// The answer.
     pub outcome: Outcome,
 }
 
-/// What came back.
+/// The result of a question.
 #[derive(Clone, Debug, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// No plan.
     Refused {
-        /// Which refusal.
+        /// Variant of the refusal.
         kind: String,
         /// Its text.
         text: String,
@@ -93,36 +93,36 @@ pub enum Outcome {
     Planned(Measured),
 }
 
-/// A plan held against the truth.
+/// A plan compared with ground truth.
 #[derive(Clone, Debug, Serialize)]
 pub struct Measured {
-    /// Why it is wrong; empty for a right answer.
+    /// Reasons for which it is wrong; empty for a correct answer.
     pub wrong: Vec<&'static str>,
-    /// Whether it is the rim that the click means, or another one beside it.
+    /// Whether it is the rim that the click selects, or another one next to it.
     pub meant: bool,
     /// "circle", "ellipse" or "round bar".
     pub model: String,
     /// Error of centre, millimetres, and normal, degrees.
     pub error: [f64; 2],
-    /// What of it the rig makes unavoidable.
-    pub share: [f64; 2],
-    /// Standard deviations as stated.
+    /// Error floor due to the rig.
+    pub floor: [f64; 2],
+    /// Stated standard deviations.
     pub sigma: [f64; 2],
-    /// Squared distance of the truth in the stated covariance: centre, normal, both together.
+    /// Squared Mahalanobis distance of ground truth: centre, normal, both together.
     pub distance: [f64; 3],
     /// Error of the bar's radius, millimetres.
     pub bar_mm: Option<f64>,
-    /// Where a perfect loop ends: millimetres from the rim's centre, degrees from its axis.
+    /// Error of a converged servo loop: millimetres from the rim's centre, degrees from its axis.
     pub loop_error: Option<[f64; 2]>,
-    /// As stated.
+    /// Stated chi-squared per degree of freedom.
     pub chi2_per_dof: f64,
 }
 
-/// A true rim and what a rig makes of it.
+/// A true rim and the error floor of a rig for it.
 struct Target<'a> {
     rim: &'a TrueRim,
     /// Centre (mm), normal (degrees), bar (mm).
-    share: [f64; 3],
+    floor: [f64; 3],
 }
 
 impl<'a> Target<'a> {
@@ -131,7 +131,7 @@ impl<'a> Target<'a> {
         let (a, b): (&Shape, &Shape) = (&rim.shape, &fit);
         let bar = a.bar.zip(b.bar).map_or(0.0, |(a, b)| (a - b).abs() * 1e3);
         let turned = a.normal.cross(&b.normal).norm().atan2(a.normal.dot(&b.normal));
-        Some(Self { rim, share: [(a.centre - b.centre).norm() * 1e3, turned.to_degrees(), bar] })
+        Some(Self { rim, floor: [(a.centre - b.centre).norm() * 1e3, turned.to_degrees(), bar] })
     }
 }
 
@@ -183,7 +183,7 @@ fn ask(prepared: &Prepared<'_>, at: [Pixel; 2], cell: &Cell, options: &PlanOptio
     prepared.plan([&l, &r], &cell.gripper, options)
 }
 
-/// `None` where the question makes no sense: the diameter of a bar that is not there.
+/// Plan options of a question; `None` for the diameter of a bar that does not exist.
 fn options(cell: &Cell, rim: RimAsk, asked: &Asked) -> Option<PlanOptions> {
     let mut o = PlanOptions::default();
     o.rim.rim = match rim {
@@ -207,14 +207,14 @@ fn processor_ms() -> f64 {
     t.tv_sec as f64 * 1e3 + t.tv_nsec as f64 * 1e-6
 }
 
-/// The variants' names of a refusal, as `Rim/Unlike`.
+/// Variant names of a refusal, for example `Rim/Unlike`.
 fn refusal(e: &PlanError) -> String {
     let debug = format!("{e:?}");
     debug.split([' ', '{']).next().unwrap_or_default().replace('(', "/").replace(')', "")
 }
 
-/// Holds a plan against the rims that the click could mean: a bar against the bar, a plane edge clicked on paint against the paint, a
-/// plane edge clicked on a silhouette against whichever of both it is nearer to.
+/// Compares a plan with the rims that the click could select: a bar with the bar, a plane edge clicked on paint with the paint,
+/// a plane edge clicked on a silhouette with the nearer one of both.
 fn measure(
     cell: &Cell,
     p: &Plan,
@@ -231,26 +231,25 @@ fn measure(
     };
     let far = |t: &Target<'_>| {
         let [c, n] = error(r, &t.rim.shape);
-        (c / (CENTRE_MM + t.share[0])).max(n / (NORMAL_DEG + t.share[1]))
+        (c / (MAX_CENTRE_MM + t.floor[0])).max(n / (MAX_NORMAL_DEG + t.floor[1]))
     };
-    let best =
-        candidates.into_iter().min_by(|a, b| far(a).total_cmp(&far(b))).ok_or("no true rim to hold it against")?;
+    let best = candidates.into_iter().min_by(|a, b| far(a).total_cmp(&far(b))).ok_or("no true rim to compare with")?;
     let truth = &best.rim.shape;
     let error = error(r, truth);
     let distance = distances(r, truth);
     let bar_mm = r.bar_radius.map(|b| (b - truth.bar.unwrap_or(0.0)).abs() * 1e3);
     let mut wrong = Vec::new();
-    // Not `>`: a covariance without an inverse holds nothing.
+    // `!(<=)` instead of `>`: the distance is NaN if the covariance has no inverse.
     if !(distance[2] <= REGION_999) {
         wrong.push("region");
     }
-    if !(error[0] <= CENTRE_MM + best.share[0]) {
+    if !(error[0] <= MAX_CENTRE_MM + best.floor[0]) {
         wrong.push("centre");
     }
-    if !(error[1] <= NORMAL_DEG + best.share[1]) {
+    if !(error[1] <= MAX_NORMAL_DEG + best.floor[1]) {
         wrong.push("normal");
     }
-    if bar_mm.is_some_and(|b| !(b <= BAR_MM + best.share[2])) {
+    if bar_mm.is_some_and(|b| !(b <= MAX_BAR_MM + best.floor[2])) {
         wrong.push("bar");
     }
     let end = loop_ends(&p.set_point.grasp, &cell.gripper.gripper, &cell.true_rig);
@@ -263,7 +262,7 @@ fn measure(
         meant: (click == Click::Paint) != truth.bar.is_some(),
         model: p.file.object.model.clone(),
         error,
-        share: [best.share[0], best.share[1]],
+        floor: [best.floor[0], best.floor[1]],
         sigma: [p.file.object.sigma_centre_mm, p.file.object.sigma_normal_deg],
         distance,
         bar_mm,
@@ -272,14 +271,14 @@ fn measure(
     })
 }
 
-/// Error of centre (mm) and normal (degrees).
+/// Errors of centre (mm) and normal (degrees).
 fn error(r: &Reconstruction, truth: &Shape) -> [f64; 2] {
     let n = &r.rim.normal;
     let turned = n.cross(&truth.normal).norm().atan2(n.dot(&truth.normal));
     [(r.rim.centre - truth.centre).norm() * 1e3, turned.to_degrees()]
 }
 
-/// Squared distance of the truth in the stated covariance of centre, normal, and both.
+/// Squared Mahalanobis distances of ground truth: centre, normal, both.
 fn distances(r: &Reconstruction, truth: &Shape) -> [f64; 3] {
     let c = truth.centre - r.rim.centre;
     let f = frame_of(&r.rim.normal);
@@ -289,7 +288,7 @@ fn distances(r: &Reconstruction, truth: &Shape) -> [f64; 3] {
     both.fixed_view_mut::<3, 2>(0, 3).copy_from(&r.cov_centre_normal);
     both.fixed_view_mut::<2, 3>(3, 0).copy_from(&r.cov_centre_normal.transpose());
     both.fixed_view_mut::<2, 2>(3, 3).copy_from(&r.cov_normal);
-    // Metres and radians of like size; only a positive definite matrix is a covariance.
+    // Metres and radians have similar magnitudes here; only a positive definite matrix is a covariance.
     let x = Vector5::new(c.x, c.y, c.z, n.x, n.y);
     let of_both = both.cholesky().map_or(f64::NAN, |l| x.dot(&l.solve(&x)));
     let of_centre = r.cov_centre.cholesky().map_or(f64::NAN, |l| c.dot(&l.solve(&c)));

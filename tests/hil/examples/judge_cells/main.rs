@@ -1,13 +1,15 @@
-//! Judges the off-line stage on rendered cells: every kind of cell, rig error, click and rim, each answer held against the truth.
+//! Judges the off-line stage on rendered cells: for every kind of cell, rig error, click and rim option, the answer is
+//! compared with ground truth.
 //!
 //! ```text
 //! cargo run --release -p graspd-hil --example judge_cells -- --kinds paint,thin,torus,ellipse --rig-errors 0,0.1:0.02,0.2:0.04,0.5:0.1
 //!     --clicks paint,outer,inner --rims auto,edge,round-bar,round-bar+d --first 1 --count 20
 //! ```
 //!
-//! An answer is wrong when the truth lies outside its own 99.9 % region, or when it is off by more than 1 mm, 0.5 degrees or (a bar's
-//! radius) 1 mm beyond the rig's unavoidable share: the error of the maximum-likelihood rim on exact edges with the same rig.
-//! "Loop" is where a gripper ends that closes perfectly on the plan's marks with the true cameras.
+//! An answer is wrong if ground truth is outside its own 99.9 % region, or if its error exceeds the error floor of the rig by
+//! more than 1 mm, 0.5 degrees or (bar radius) 1 mm. The error floor is the error of the maximum-likelihood rim on exact edges
+//! with the same rig. "Loop" is the error of a gripper whose servo loop, with the true cameras, has converged on the plan's
+//! marks.
 
 #![allow(unreachable_pub)] // modules shared by path with a test
 
@@ -29,22 +31,22 @@ struct Args {
     /// Kinds of cells
     #[arg(long, value_delimiter = ',', default_value = "paint,thin,torus,ellipse")]
     kinds: Vec<Kind>,
-    /// Errors of the rig as given: PERCENT:DEG of focal lengths and relative rotation
+    /// Errors of the given rig: PERCENT:DEG of focal lengths and relative rotation
     #[arg(long, value_delimiter = ',', value_parser = RigError::parse, default_value = "0,0.1:0.02,0.2:0.04,0.5:0.1")]
     rig_errors: Vec<RigError>,
     /// Where to click
     #[arg(long, value_delimiter = ',', default_value = "paint,outer,inner")]
     clicks: Vec<Click>,
-    /// What to say about the rim
+    /// Rim option of the plan
     #[arg(long, value_delimiter = ',', default_value = "auto,edge,round-bar,round-bar+d")]
     rims: Vec<RimAsk>,
     /// First seed
     #[arg(long, default_value_t = 1)]
     first: u64,
-    /// How many seeds
+    /// Number of seeds
     #[arg(long, default_value_t = 20)]
     count: u64,
-    /// Noise of the images
+    /// Image noise
     #[arg(long, value_enum, default_value = "scene")]
     noise: Noise,
     /// Tolerance of the centre, mm (one sigma)
@@ -53,19 +55,19 @@ struct Args {
     /// Tolerance of the normal, degrees (one sigma)
     #[arg(long, default_value_t = 1.0)]
     tolerance_deg: f64,
-    /// The rig's stated calibration error, pixels [default: the planner's]
+    /// Stated calibration error of the rig, pixels [default: that of the planner]
     #[arg(long)]
     calibration_px: Option<f64>,
-    /// Cells judged at a time
+    /// Cells judged in parallel
     #[arg(long, default_value_t = 2)]
     threads: usize,
-    /// One line for every answer
+    /// Print one line per answer
     #[arg(long)]
     verbose: bool,
-    /// Write every answer and the table
+    /// Write all answers and the table to this file
     #[arg(long)]
     json: Option<PathBuf>,
-    /// Write the images of every cell into a folder
+    /// Write the images of every cell into this folder
     #[arg(long)]
     images: Option<PathBuf>,
 }
@@ -126,20 +128,20 @@ fn one(args: &Args, kind: Kind, seed: u64) -> Result<Vec<Answer>, String> {
     judge(&cell, &args.rig_errors, &args.clicks, &args.rims, &asked)
 }
 
-/// An answer for people.
+/// An answer as a line of text.
 fn line(a: &Answer) -> String {
     let question = format!("{:?}-{} [{}] {:?} {:?}", a.kind, a.seed, a.rig_error, a.click, a.rim).to_lowercase();
     match &a.outcome {
         Outcome::Refused { kind, text } => format!("{question}: refused {kind}: {text}"),
         Outcome::Planned(m) => format!(
-            "{question}: {} {}{}: centre {:.3} mm, normal {:.3} deg; share {:.3} {:.3}; sigma {:.3} {:.3}; distance {:.1} {:.1} {:.1}; bar {:.2?} mm; loop {:.3?}; chi2 {:.2}; {:.0} ms",
+            "{question}: {} {}{}: centre {:.3} mm, normal {:.3} deg; floor {:.3} {:.3}; sigma {:.3} {:.3}; distance {:.1} {:.1} {:.1}; bar {:.2?} mm; loop {:.3?}; chi2 {:.2}; {:.0} ms",
             if m.wrong.is_empty() { "right".to_owned() } else { format!("WRONG ({})", m.wrong.join(", ")) },
             m.model,
             if m.meant { "" } else { ", another rim" },
             m.error[0],
             m.error[1],
-            m.share[0],
-            m.share[1],
+            m.floor[0],
+            m.floor[1],
             m.sigma[0],
             m.sigma[1],
             m.distance[0],

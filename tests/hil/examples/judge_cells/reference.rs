@@ -1,6 +1,7 @@
-//! What nobody can do better: the maximum-likelihood rim on exact edge points with the rig as given, and where a perfect loop ends.
+//! Reference results: the maximum-likelihood rim on exact edge points with a given rig, and the end pose of a converged servo
+//! loop.
 //!
-//! Written apart from the off-line stage that is judged: numeric derivatives, no gates, no shared code but the camera model.
+//! Independent of the off-line stage that is judged: numeric derivatives, no gates, only the camera model is shared.
 
 use graspd_rt::geom::{Pixel, Pose, Rig, Vec3, View, exp_twist};
 use graspd_rt::gripper::Gripper;
@@ -8,10 +9,10 @@ use graspd_rt::setpoint::Goal;
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Point3, Rotation3, UnitQuaternion, Vector2};
 use std::f64::consts::TAU;
 
-/// Edge points of a view on a whole rim.
+/// Edge points per image on an unoccluded rim.
 pub const POINTS: usize = 150;
-/// Steps of the fits; they end earlier when they stand still.
-const STEPS: usize = 40;
+/// Iterations of a fit; it ends earlier when it converges.
+const MAX_ITERATIONS: usize = 40;
 
 /// A rim in space: a plane circle or ellipse, or a round bar bent to a circle.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -48,10 +49,10 @@ impl Shape {
         self.centre + self.axis_a * (self.axes[0] * angle.cos()) + y * (self.axes[1] * angle.sin())
     }
 
-    /// Points of a bar's outer and inner outline at a core angle as seen from a place; `None` where the eye is inside the bar's reach.
+    /// Points of the outer and inner outline of a bar at a core angle, seen from `eye`; `None` for a plane edge.
     ///
-    /// On the tube around core direction `e` the surface normal `m = e cos v + n sin v` is perpendicular to the sight line:
-    /// `m . d = -r`, with `d` from the eye to the core point.
+    /// On the tube around core direction `e` the surface normal `m = e cos v + n sin v` is perpendicular to the viewing ray:
+    /// `m . d = -r`, with `d` from the camera centre to the core point.
     pub fn outlines(&self, eye: &Vec3, angle: f64) -> Option<[Vec3; 2]> {
         let bar = self.bar?;
         let core = self.point(angle);
@@ -66,7 +67,7 @@ impl Shape {
         Some(v.map(|v| core + (e * v.cos() + self.normal * v.sin()) * bar))
     }
 
-    /// How many numbers describe it: the circle's 6, the ellipse's 8, the bar's 7.
+    /// Number of parameters: circle 6, ellipse 8, bar 7.
     fn parameters(&self) -> usize {
         match self.bar {
             Some(_) => 7,
@@ -75,7 +76,7 @@ impl Shape {
         }
     }
 
-    /// The ray's signed distance from the rim, metres: across the plane's curve, or from the bar's surface.
+    /// Signed distance of a ray from the rim, metres: from the curve in its plane, or from the bar's surface.
     fn distance(&self, s: &Matrix2<f64>, ray: &Ray) -> f64 {
         let y = self.normal.cross(&self.axis_a);
         if let Some(bar) = self.bar {
@@ -87,7 +88,7 @@ impl Shape {
         s.try_inverse().map_or(f64::NAN, |i| ((i * in_plane).norm() - 1.0) * self.axes[0])
     }
 
-    /// Distance of a ray from the bar's core circle, by Newton's steps on the angle.
+    /// Distance of a ray from the bar's core circle, by Newton iterations on the angle.
     fn distance_to_core(&self, ray: &Ray, y: &Vec3) -> f64 {
         let radius = self.axes[0];
         let across = |v: Vec3| v - ray.way * ray.way.dot(&v);
@@ -110,7 +111,7 @@ impl Shape {
     }
 }
 
-/// Two unit vectors across a normal.
+/// Two unit vectors perpendicular to a normal.
 fn frame(n: &Vec3) -> [Vec3; 2] {
     let x = if n.x.abs() < 0.9 { Vec3::x() } else { Vec3::y() };
     let x = (x - n * n.dot(&x)).normalize();
@@ -129,13 +130,13 @@ fn ray(rig: &Rig, view: View, pixel: Pixel) -> Option<Ray> {
     Some(Ray { eye: rig.centre(view), way: to_left.rotation * rig.camera(view).ray(pixel)? })
 }
 
-/// A pixel's ray and those half a pixel to its four sides, which give the change of a distance by the pixel.
+/// The ray of a pixel and those half a pixel to its four sides, for the derivative of a distance by the pixel position.
 struct Seen {
     at: Ray,
     around: [Ray; 4],
 }
 
-/// The shape moved by parameters: centre, tilt, then radius, or symmetric shape matrix, or core and bar.
+/// The shape changed by parameters: centre, tilt, then radius, or symmetric shape matrix, or core and bar radius.
 fn moved(start: &Shape, x: &DVector<f64>) -> (Shape, Matrix2<f64>) {
     let y = start.normal.cross(&start.axis_a);
     let unit = start.axes[0];
@@ -157,13 +158,13 @@ fn moved(start: &Shape, x: &DVector<f64>) -> (Shape, Matrix2<f64>) {
     (out, s)
 }
 
-/// Minimises a sum of squares by damped Gauss-Newton steps with numeric derivatives.
+/// Minimises a sum of squares by damped Gauss-Newton iterations with numeric derivatives.
 fn minimise(n: usize, residuals: impl Fn(&DVector<f64>) -> Option<DVector<f64>>) -> Option<DVector<f64>> {
     const H: f64 = 1e-6;
     let mut x = DVector::zeros(n);
     let mut r = residuals(&x)?;
     let mut damping = 1e-6;
-    for _ in 0..STEPS {
+    for _ in 0..MAX_ITERATIONS {
         let mut j = DMatrix::zeros(r.len(), n);
         for k in 0..n {
             let mut ahead = x.clone();
@@ -197,7 +198,7 @@ fn minimise(n: usize, residuals: impl Fn(&DVector<f64>) -> Option<DVector<f64>>)
     Some(x)
 }
 
-/// The rim that fits raw edge pixels best when a rig is believed, starting from the truth: distances in pixels, every point alike.
+/// The rim that fits raw edge pixels best for a given rig, starting from `start`: distances in pixels, equal weights.
 pub fn best_fit(start: &Shape, pixels: &[Vec<Pixel>; 2], rig: &Rig) -> Option<Shape> {
     let mut seen = Vec::new();
     for view in View::BOTH {
@@ -208,7 +209,7 @@ pub fn best_fit(start: &Shape, pixels: &[Vec<Pixel>; 2], rig: &Rig) -> Option<Sh
         }
     }
     let mut shape = *start;
-    // The change of a distance by the pixel belongs to a shape: fitted, renewed, fitted again.
+    // The derivative of a distance by the pixel position depends on the shape: fit and derivative alternate.
     for _ in 0..4 {
         let s = Matrix2::new(shape.axes[0], 0.0, 0.0, shape.axes[1]);
         let weight: Vec<f64> = seen
@@ -244,10 +245,10 @@ fn with_shape(mut shape: Shape, s: &Matrix2<f64>) -> Shape {
     shape
 }
 
-/// Where the gripper stands when a loop with the true cameras has brought the marks onto a goal's predicted pixels as well as they go:
-/// least squares over both images.
+/// Gripper pose of a converged servo loop with the true cameras: the least-squares fit of the projected marks to the goal's
+/// predicted pixels in both images.
 pub fn loop_ends(goal: &Goal, gripper: &Gripper, true_rig: &Rig) -> Option<Pose> {
-    let wanted: Vec<(View, Vec3, Pixel)> = View::BOTH
+    let predicted: Vec<(View, Vec3, Pixel)> = View::BOTH
         .into_iter()
         .flat_map(|v| {
             let marks = gripper.marks.iter().zip(goal.marks[v.index()]);
@@ -255,15 +256,15 @@ pub fn loop_ends(goal: &Goal, gripper: &Gripper, true_rig: &Rig) -> Option<Pose>
         })
         .collect();
     let pose = |x: &DVector<f64>| {
-        // Rotations in radians, translations in decimetres: about the same effect on the pixels.
+        // Rotations in radians, translations in decimetres: both then have similar effects on the pixels.
         let v = Vec3::new(x[0], x[1], x[2]) * 0.1;
         let twist = [v.x, v.y, v.z, x[3], x[4], x[5]];
         goal.left_from_gripper * exp_twist(&twist.into())
     };
     let x = minimise(6, |x| {
         let pose = pose(x);
-        let mut r = Vec::with_capacity(2 * wanted.len());
-        for (view, mark, pixel) in &wanted {
+        let mut r = Vec::with_capacity(2 * predicted.len());
+        for (view, mark, pixel) in &predicted {
             let d = true_rig.project(*view, &(pose * Point3::from(*mark)).coords)? - pixel;
             r.extend([d.x, d.y]);
         }
@@ -272,7 +273,7 @@ pub fn loop_ends(goal: &Goal, gripper: &Gripper, true_rig: &Rig) -> Option<Pose>
     Some(pose(&x))
 }
 
-/// Angles of `n` places around a rim.
+/// `n` equally spaced angles.
 pub fn around(n: usize) -> impl Iterator<Item = f64> {
     (0..n).map(move |k| TAU * k as f64 / n as f64)
 }
@@ -321,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn exact_edges_and_the_true_rig_give_the_rim_back_from_a_start_beside_it() {
+    fn exact_edges_and_the_true_rig_reproduce_the_rim_from_a_displaced_start() {
         let (rig, _) = rigs();
         for (truth, pixels) in shapes(&rig) {
             let mut start = truth;
@@ -338,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wrong_rig_has_its_share_in_depth_and_little_of_it_in_the_normal() {
+    fn a_wrong_rig_causes_an_error_in_depth_and_a_small_one_in_the_normal() {
         let (rig, given) = rigs();
         for (truth, pixels) in shapes(&rig) {
             let [mm, deg] = off(&best_fit(&truth, &pixels, &given).unwrap(), &truth);
@@ -348,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn a_loop_with_the_rig_that_predicted_the_marks_ends_at_the_goal_and_with_another_elsewhere() {
+    fn a_loop_ends_at_the_goal_only_with_the_rig_that_predicted_the_marks() {
         let (rig, given) = rigs();
         let gripper = default_gripper().gripper;
         let at = shapes(&rig)[0].0.pose();
@@ -361,7 +362,7 @@ mod tests {
             }
         }
         let between = |a: &Pose, b: &Pose| (a.translation.vector - b.translation.vector).norm() * 1e3;
-        // From a start that is not yet there.
+        // From a displaced start.
         goal.left_from_gripper = goal_pose * Pose::translation(0.004, -0.003, 0.01);
         assert!(between(&loop_ends(&goal, &gripper, &rig).unwrap(), &goal_pose) < 1e-5);
         assert!(between(&loop_ends(&goal, &gripper, &given).unwrap(), &goal_pose) > 0.3);

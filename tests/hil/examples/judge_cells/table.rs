@@ -1,4 +1,4 @@
-//! Answers counted: one row for each kind of cell, rig error, click and rim.
+//! Statistics of the answers: one row for each kind of cell, rig error, click and rim option.
 
 use crate::cell::{Click, Kind, RigError};
 use crate::judge::{Answer, CENTRE_95, Measured, NORMAL_95, Outcome, RimAsk};
@@ -10,33 +10,33 @@ use std::collections::BTreeMap;
 pub struct Row {
     /// Kind of the cells.
     pub kind: Kind,
-    /// Error of the rig as given.
+    /// Error of the given rig.
     pub rig_error: String,
-    /// Where was clicked.
+    /// Place of the click.
     pub click: Click,
-    /// What was said.
+    /// Rim option.
     pub rim: RimAsk,
-    /// Questions.
+    /// Number of questions.
     pub n: usize,
-    /// Answered with the rim that the click means, right.
+    /// Correct answers with the rim that the click selects.
     pub right: usize,
-    /// Answered with another true rim beside it, right.
+    /// Correct answers with another rim next to it.
     pub other: usize,
     /// Refused, by kind.
     pub refused: BTreeMap<String, usize>,
-    /// Answered wrongly.
+    /// Wrong answers.
     pub wrong: usize,
-    /// Why, each reason by itself: region, centre, normal, bar.
+    /// Reasons of the wrong answers: region, centre, normal, bar.
     pub reasons: BTreeMap<String, usize>,
-    /// Error of the centre, mm: median, 95 %, worst.
+    /// Error of the centre, mm: median, 95 %, largest.
     pub centre_mm: [f64; 3],
-    /// Error of the normal, degrees.
+    /// Error of the normal, degrees: median, 95 %, largest.
     pub normal_deg: [f64; 3],
-    /// What of both the rig makes unavoidable: medians.
-    pub share: [f64; 2],
-    /// Percent of answers with the truth in the 95 % region: centre, normal.
+    /// Error floor of centre and normal due to the rig: medians.
+    pub floor: [f64; 2],
+    /// Percentage of answers with ground truth in the 95 % region: centre, normal.
     pub coverage: [f64; 2],
-    /// Where a perfect loop ends, mm: median, 95 %.
+    /// Error of a converged servo loop, mm: median, 95 %.
     pub loop_mm: [f64; 2],
     /// The same, degrees.
     pub loop_deg: [f64; 2],
@@ -44,7 +44,7 @@ pub struct Row {
     pub ms: [f64; 2],
 }
 
-/// The value at a share of the sorted values.
+/// The value at a fraction of the sorted values.
 pub fn percentile(v: impl IntoIterator<Item = f64>, q: f64) -> f64 {
     let mut v: Vec<f64> = v.into_iter().collect();
     v.sort_by(f64::total_cmp);
@@ -52,7 +52,7 @@ pub fn percentile(v: impl IntoIterator<Item = f64>, q: f64) -> f64 {
     v.get(k - 1).copied().unwrap_or(f64::NAN)
 }
 
-/// Counts the answers of one row.
+/// Evaluates the answers of one row.
 fn row(answers: &[&Answer]) -> Option<Row> {
     let first = answers.first()?;
     let mut refused = BTreeMap::new();
@@ -85,7 +85,7 @@ fn row(answers: &[&Answer]) -> Option<Row> {
         reasons,
         centre_mm: three(&|m| m.error[0]),
         normal_deg: three(&|m| m.error[1]),
-        share: [of(&|m| m.share[0], 0.5), of(&|m| m.share[1], 0.5)],
+        floor: [of(&|m| m.floor[0], 0.5), of(&|m| m.floor[1], 0.5)],
         coverage: [percent(count(&|m| m.distance[0] <= CENTRE_95)), percent(count(&|m| m.distance[1] <= NORMAL_95))],
         loop_mm: ended(0),
         loop_deg: ended(1),
@@ -93,7 +93,7 @@ fn row(answers: &[&Answer]) -> Option<Row> {
     })
 }
 
-/// All rows, in the order of the questions; rows without a question are left out.
+/// All rows in the order of the questions; rows without questions are omitted.
 pub fn rows(answers: &[Answer], kinds: &[Kind], errors: &[RigError], clicks: &[Click], rims: &[RimAsk]) -> Vec<Row> {
     let mut out = Vec::new();
     for kind in kinds {
@@ -114,15 +114,15 @@ fn counted(m: &BTreeMap<String, usize>) -> String {
     m.iter().map(|(k, n)| format!("{k} {n}")).collect::<Vec<_>>().join(", ")
 }
 
-/// A figure; a dash where nothing was answered.
+/// A figure; a dash for NaN (no answer).
 fn figure(x: f64, digits: usize) -> String {
     if x.is_finite() { format!("{x:.digits$}") } else { "-".to_owned() }
 }
 
-/// The table as text, fit for a document.
+/// The table in Markdown.
 pub fn text(rows: &[Row]) -> String {
     let mut out = String::from(
-        "| cells | rig error | click | rim | n | right | other rim | refused | WRONG | centre mm 50/95/100 % | normal deg 50/95/100 % | share mm, deg | in 95 % region, % | loop mm 50/95 % | loop deg 50/95 % | ms 50/95 % | refusals; reasons |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+        "| cells | rig error | click | rim | n | right | other rim | refused | WRONG | centre mm 50/95/100 % | normal deg 50/95/100 % | floor mm, deg | in 95 % region, % | loop mm 50/95 % | loop deg 50/95 % | ms 50/95 % | refusals; reasons |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for r in rows {
         let [c, n] = [&r.centre_mm, &r.normal_deg].map(|v| v.map(|x| figure(x, 2)).join(" / "));
@@ -144,8 +144,8 @@ pub fn text(rows: &[Row]) -> String {
             r.other,
             r.refused.values().sum::<usize>(),
             r.wrong,
-            figure(r.share[0], 2),
-            figure(r.share[1], 2),
+            figure(r.floor[0], 2),
+            figure(r.floor[1], 2),
             figure(r.coverage[0], 0),
             figure(r.coverage[1], 0),
             r.ms[0],

@@ -16,16 +16,17 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// A mock Universal Robots controller: dashboard 29999, primary 30001, secondary 30002, real-time 30003, RTDE 30004.
+/// A mock Universal Robots controller: dashboard 29999, primary 30001, secondary 30002, real-time 30003, RTDE 30004, interpreter 30020.
 ///
-/// It runs uploaded URScript, moves a simulated arm, and judges every set-point. When it is ready it prints one line of JSON.
+/// It runs uploaded URScript, moves a simulated arm and checks every set-point. When it is ready it prints one line of
+/// JSON.
 #[derive(Parser, Debug, Clone)]
 #[command(name = "graspd-mock-ur", version)]
 pub struct Args {
-    /// Arm: ur3, ur5, ur10, ur3e, ur5e, ur10e, ur16e, ur20, ur30
+    /// Arm model: ur3, ur5, ur10, ur3e, ur5e, ur10e, ur16e, ur20 or ur30
     #[arg(long, default_value = "ur5e")]
     pub model: String,
-    /// Address to listen on; 127.0.0.2 and so on let several run with the robot's own port numbers
+    /// Address to listen on; several mocks can keep the standard port numbers on 127.0.0.2, 127.0.0.3 ...
     #[arg(long, default_value = "127.0.0.1")]
     pub bind: IpAddr,
     /// Added to every port number
@@ -34,28 +35,28 @@ pub struct Args {
     /// Write every input package and every control step to this file
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
-    /// Take JSON commands (faults, state, summary) on this port; 0 picks a free one
+    /// Accept JSON commands (faults, state, summary) on this port; 0 picks a free port
     #[arg(long, value_name = "PORT")]
     pub control_port: Option<u16>,
-    /// Joint positions at the start, rad
+    /// Initial joint positions, rad
     #[arg(long, value_parser = numbers::<6>, value_name = "Q1,..,Q6", allow_hyphen_values = true)]
     pub start_joints: Option<[f64; 6]>,
-    /// The unit's own DH parameters: TOML with a table dh of a, d, alpha, theta
+    /// Calibrated DH parameters of the unit: a TOML file with a table dh of a, d, alpha and theta
     #[arg(long, value_name = "FILE")]
     pub kinematics: Option<PathBuf>,
-    /// Control steps a second; the model's own unless given
+    /// Control rate; by default that of the model
     #[arg(long, value_name = "HZ")]
     pub rate: Option<f64>,
-    /// Rate (rad/s) and acceleration (rad/s^2) that the client promised to keep; the oracle holds it to them
+    /// Joint speed (rad/s) and acceleration (rad/s^2) that the client must not exceed
     #[arg(long, value_parser = numbers::<2>, value_name = "V,A")]
     pub limits: Option<[f64; 2]>,
-    /// Start without power
+    /// Start with the arm powered off
     #[arg(long)]
     pub powered_off: bool,
-    /// Seconds that powering on and releasing the brakes take, each
+    /// Duration of powering on and of releasing the brakes, each
     #[arg(long, default_value_t = 1.0, value_name = "S")]
     pub power_time: f64,
-    /// Controller's clock at the start, s
+    /// Controller time at the start
     #[arg(long, default_value_t = 60.0, value_name = "S")]
     pub clock: f64,
     /// Serial number
@@ -64,10 +65,10 @@ pub struct Args {
     /// Directory in which `load NAME.urp` finds NAME.script
     #[arg(long, value_name = "DIR")]
     pub programs: Option<PathBuf>,
-    /// End when standard input ends, so that no mock outlives the test that started it
+    /// Exit when standard input is closed, so that no mock outlives the test that started it
     #[arg(long)]
     pub exit_with_stdin: bool,
-    /// End after so many seconds at the latest
+    /// Exit after this many seconds at the latest
     #[arg(long, value_name = "S")]
     pub max_seconds: Option<f64>,
 }
@@ -81,11 +82,11 @@ enum StartError {
     Kinematics(#[from] crate::plant::KinematicsFileError),
     #[error(transparent)]
     Listen(#[from] super::server::ListenError),
-    #[error("--start-joints: {0} is not a joint position within the arm's range (rad)")]
+    #[error("--start-joints: {0} rad is outside the arm's joint range")]
     Joint(f64),
-    #[error("--rate {0}: give 50 to 1000 Hz")]
+    #[error("--rate {0}: expected 50 to 1000 Hz")]
     Rate(f64),
-    #[error("--limits: give a rate and an acceleration above zero, got {0} and {1}")]
+    #[error("--limits {0},{1}: joint speed and acceleration must be above zero")]
     Limits(f64, f64),
     #[error("--record {0}: {1}")]
     Record(PathBuf, std::io::Error),
@@ -102,7 +103,7 @@ where
     let args = match Args::try_parse_from(args) {
         Ok(args) => args,
         Err(e) => {
-            // Help and version are no errors; their texts go where clap wants them.
+            // Help and version also arrive here; clap prints them to standard output.
             let _ = e.print();
             return e.exit_code();
         }
@@ -177,14 +178,14 @@ fn run(args: &Args) -> Result<(), StartError> {
     }
     let world = World::new(Robot::new(setup), limits, recorder);
     let mut server = Server::bind(world, args.bind, args.port_offset, args.control_port)?;
-    crate::host::prefer_this_thread(crate::host::CONTROLLER, -15);
+    crate::host::prefer_this_thread(crate::host::CONTROLLER_FIFO, -15);
     announce(args, &server);
     server.run(&stop);
     conclude(server);
     Ok(())
 }
 
-/// The ready line: everything that a test needs to connect.
+/// Prints the ready line: everything that a test needs to connect.
 fn announce(args: &Args, server: &Server) {
     let port = |n: u16| n.saturating_add(args.port_offset);
     let line = json!({
@@ -197,17 +198,18 @@ fn announce(args: &Args, server: &Server) {
         "secondary": port(30002),
         "realtime": port(30003),
         "rtde": port(30004),
+        "interpreter": port(30020),
         "control": server.control_port(),
         "rate_hz": server.world.robot.setup.rate_hz,
         "pid": std::process::id(),
         "now_ns": now_ns(),
     });
     let mut out = std::io::stdout().lock();
-    // A starter that does not listen does not matter.
+    // Whoever started the mock may have closed its standard output.
     let _ = writeln!(out, "{line}").and_then(|()| out.flush());
 }
 
-/// The summary line at the end.
+/// Prints the summary line.
 fn conclude(mut server: Server) {
     let summary = server.world.judge.summary();
     let recorder = server.world.recorder.take();

@@ -1,7 +1,7 @@
-//! The control port's language: one JSON object a line, `{"cmd": "protective_stop"}`, one answer a line.
+//! Commands of the control port: one JSON object per line, `{"cmd": "protective_stop"}`, answered by one line.
 //!
-//! Every row R and B of the fault catalogue that a controller or its wires can show has a command here; the row is named in the
-//! comment. `clear_faults` ends all but safety stops.
+//! There is a command for every fault that a controller or its network connection can show. `clear_faults` ends all
+//! faults except safety stops.
 
 use super::state::RobotMode;
 use serde::{Deserialize, Serialize};
@@ -18,160 +18,175 @@ pub enum Port {
     Secondary,
     /// 30003 and its read-only twin.
     Realtime,
+    /// 30020.
+    Interpreter,
     /// 30004.
     #[default]
     Rtde,
-    /// The control port itself; it takes no faults.
+    /// The control port itself; network faults do not apply to it.
     Control,
 }
 
-/// What the server shall do with the connections of a port.
+/// An action on all connections of a port, carried out by the server.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum WireAction {
     /// Close with RST.
     Reset(Port),
-    /// Close in order.
+    /// Close with FIN.
     Close(Port),
     /// Send these bytes between two packages.
     Inject(Port, Vec<u8>),
 }
 
-/// Commands and queries. `port` is `rtde` unless given.
+/// Commands and queries. `port` defaults to `rtde`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "cmd", rename_all = "snake_case", deny_unknown_fields)]
-#[expect(missing_docs, reason = "fields are named in SI units or explained by their variant")]
+#[expect(missing_docs, reason = "fields are in SI units or are explained at their variant")]
 pub enum Command {
     /// Answers `done`.
     Ping,
-    /// The robot's state.
+    /// Query: the robot's state.
     State,
-    /// The oracle's summary.
+    /// Query: the judge's summary.
     Summary,
-    /// The rate and acceleration that clients have promised.
+    /// Sets the joint speed and acceleration that clients must not exceed.
     Limits { rate: f64, accel: f64 },
-    /// B01.
+    /// Protective stop.
     ProtectiveStop,
-    /// B15: a force, then a protective stop.
+    /// Collision: a force along x at the TCP, then a protective stop.
     Collision {
         #[serde(default)]
         force: f64,
     },
-    /// B02.
+    /// Emergency stop by the pendant's button, or by the system emergency input.
     EmergencyStop {
         #[serde(default)]
         system: bool,
     },
-    /// B02.
+    /// Safeguard stop.
     SafeguardStop,
-    /// B02: violation, or fault of the safety system.
+    /// Safety violation, or a fault of the safety system.
     SafetyFailure {
         #[serde(default)]
         fault: bool,
     },
-    /// Emergency button and safeguard back to normal.
+    /// Releases the emergency button and closes the safeguard.
     ClearSafety,
-    /// As the dashboard's `unlock protective stop`.
+    /// Like the dashboard's `unlock protective stop`.
     Unlock,
-    /// B04.
+    /// Reduced mode.
     Reduced { on: bool },
-    /// B03.
+    /// Sets the robot mode immediately.
     RobotMode { mode: RobotMode },
-    /// B03.
+    /// Powers the arm off.
     PowerOff,
-    /// Straight back to running and normal, for the next test.
+    /// Returns to running and normal immediately, for the next test.
     Restore,
-    /// B03: local control refuses uploads.
+    /// Remote control; in local control uploads are refused.
     RemoteControl { on: bool },
-    /// B05.
+    /// Speed slider, 0 to 1.
     SpeedSlider { fraction: f64 },
-    /// B06.
+    /// Pauses the program.
     PauseProgram,
-    /// As the dashboard's `play`.
+    /// Like the dashboard's `play`.
     PlayProgram,
-    /// B06.
+    /// Stops the program.
     StopProgram,
-    /// R13: somebody else's program.
+    /// Uploads a program as another client would.
     Script { text: String },
-    /// B10.
+    /// Reports NaN as the position of one joint.
     NanPosition { joint: usize },
-    /// B10.
+    /// Reports NaN as the speed of one joint.
     NanSpeed { joint: usize },
-    /// B10: the reported position jumps for a while.
+    /// Shifts the reported position of one joint for a time.
     Jump {
         joint: usize,
         rad: f64,
         #[serde(default)]
         seconds: f64,
     },
-    /// B17: two joints told in each other's place.
+    /// Exchanges two joints in the report.
     SwapJoints { a: usize, b: usize },
-    /// B09: creeps without a command, rad/s.
+    /// One joint drifts without a command, rad/s.
     Drift { joint: usize, rate: f64 },
-    /// B08: trails its targets.
+    /// The joints follow their targets with an additional time constant.
     Lag { seconds: f64 },
-    /// B08: one joint does not move.
+    /// One joint does not move.
     Stuck { joint: usize },
-    /// B07, B11: the arm stands somewhere else.
+    /// Places the arm at other joint positions, at rest.
     Teleport { q: [f64; 6] },
-    /// B16.
+    /// Payload mass.
     Payload { kg: f64 },
-    /// B16.
+    /// TCP in the flange frame: m and rotation vector in rad.
     Tcp { pose: [f64; 6] },
-    /// B17: another robot type in the configuration.
+    /// Reports another robot type in the configuration data.
     ClaimRobotType { number: i32 },
-    /// Digital inputs as a whole.
+    /// Sets all digital inputs.
     DigitalIn { bits: u64 },
-    /// R13: an output register with another value, until a script writes it again.
+    /// Overwrites an output register, until a script writes it again.
     OutputInt { index: usize, value: i32 },
-    /// R04, R15: what scripts write is not seen.
+    /// A plane that the TCP can touch: a point (m), the normal towards the free side, the stiffness (N/m).
+    ContactPlane {
+        point: [f64; 3],
+        normal: [f64; 3],
+        #[serde(default = "default_stiffness")]
+        stiffness: f64,
+    },
+    /// Wrench of the environment on the TCP, base frame, N and Nm.
+    ExternalWrench { wrench: [f64; 6] },
+    /// Value of a Modbus signal that a script has added.
+    ModbusSignal { name: String, value: i32 },
+    /// Register of the robot's Modbus server.
+    PortRegister { address: u16, value: u16 },
+    /// Discards what scripts write to output registers.
     MuteOutputs { on: bool },
-    /// R15: `rtde_set_watchdog` has no effect.
+    /// `rtde_set_watchdog` is accepted without effect.
     NoWatchdog { on: bool },
-    /// R12.
+    /// Restarts controller time at zero.
     ClockRestart,
-    /// R12.
+    /// Shifts controller time.
     ClockShift { seconds: f64 },
-    /// R10.
+    /// Refuses RTDE protocol version 2.
     RefuseV2 { on: bool },
-    /// R09.
+    /// RTDE inputs answered with `IN_USE`.
     InUse { names: Vec<String> },
-    /// R09.
+    /// RTDE names answered with `NOT_FOUND`.
     NotFound { names: Vec<String> },
-    /// R09.
+    /// RTDE names answered with another type.
     WrongType { names: Vec<String> },
-    /// R11: one package of so many is sent.
+    /// Sends only one of every `n` output packages.
     KeepOneOf { n: u32 },
-    /// R03: nothing passes either way.
+    /// Loses everything in both directions.
     Blackhole {
         #[serde(default)]
         port: Port,
         seconds: f64,
     },
-    /// R04: what clients write is lost.
+    /// Loses what clients send.
     LoseUpstream {
         #[serde(default)]
         port: Port,
         seconds: f64,
     },
-    /// R03: what the controller writes is lost.
+    /// Loses what the controller sends.
     LoseDownstream {
         #[serde(default)]
         port: Port,
         seconds: f64,
     },
-    /// R06: kept back, then sent at once.
+    /// Holds back what the controller sends, then sends it in one burst.
     Hold {
         #[serde(default)]
         port: Port,
         seconds: f64,
     },
-    /// R14: clients are not read.
+    /// Does not read from clients.
     StopReading {
         #[serde(default)]
         port: Port,
         seconds: f64,
     },
-    /// R05.
+    /// Delays what the controller sends.
     Delay {
         #[serde(default)]
         port: Port,
@@ -179,44 +194,49 @@ pub enum Command {
         #[serde(default)]
         jitter_ms: f64,
     },
-    /// R07: pieces of so many bytes; 0 ends it.
+    /// Sends in pieces of this many bytes; 0 ends it.
     Chunk {
         #[serde(default)]
         port: Port,
         bytes: usize,
     },
-    /// R01: connections are refused.
+    /// Refuses connections.
     Refuse {
         #[serde(default)]
         port: Port,
         on: bool,
     },
-    /// R02.
+    /// Closes connections with RST.
     Reset {
         #[serde(default)]
         port: Port,
     },
-    /// R02.
+    /// Closes connections with FIN.
     Close {
         #[serde(default)]
         port: Port,
     },
-    /// R08.
+    /// Sends random bytes between two packages.
     Garbage {
         #[serde(default)]
         port: Port,
         bytes: usize,
     },
-    /// R08.
+    /// Sends a package whose length is less than its header.
     WrongLength {
         #[serde(default)]
         port: Port,
     },
-    /// R08.
+    /// Sends a package of unknown type.
     UnknownType {
         #[serde(default)]
         port: Port,
     },
-    /// Everything back to normal but safety stops.
+    /// Ends all faults except safety stops.
     ClearFaults,
+}
+
+/// Stiffness of a contact plane, N/m.
+fn default_stiffness() -> f64 {
+    2000.0
 }

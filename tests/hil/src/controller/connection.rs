@@ -1,4 +1,4 @@
-//! One client's connection: bytes out with their faults, bytes in by role.
+//! One client connection: its send queue with the network faults, and its role.
 
 use super::command::Port;
 use super::link_faults::WireFaults;
@@ -9,24 +9,26 @@ use std::io::{ErrorKind, Read, Write};
 use std::net::TcpStream;
 use std::time::Duration;
 
-/// An RTDE client that does not read is cut off after this long, as by a real controller.
-const CUT_OFF_NS: u64 = 10_000_000_000;
-/// Bytes that may wait for a client, kept-back ones included.
-const MOST_WAITING: usize = 4 << 20;
-/// Bytes read at a time.
-pub(super) const READ: usize = 64 * 1024;
+/// Time after which an RTDE client that does not read is disconnected, as by a real controller.
+const MAX_BLOCKED_NS: u64 = 10_000_000_000;
+/// Bytes queued for one client, including those held back by a fault.
+const MAX_QUEUED_BYTES: usize = 4 << 20;
+/// Bytes read in one call.
+pub(super) const READ_BYTES: usize = 64 * 1024;
 
-/// What a client talks to.
+/// The service that a connection belongs to.
 pub(super) enum Role {
-    /// Lines in, lines out.
+    /// Dashboard: lines in, lines out. Holds the incomplete last line.
     Dashboard(Vec<u8>),
-    /// State and messages out; scripts in, unless read-only.
+    /// Primary or secondary: state and messages out; scripts in, unless read-only.
     State { scripts: Option<Collector> },
-    /// The real-time package out; scripts in, unless read-only.
+    /// Real-time package out; scripts in, unless read-only.
     Realtime { scripts: Option<Collector> },
     /// RTDE.
     Rtde(Box<RtdeSession>),
-    /// JSON lines.
+    /// Interpreter port: statements in, answers out. Holds the incomplete last line.
+    Interpreter(Vec<u8>),
+    /// Control port: JSON lines. Holds the incomplete last line.
     Control(Vec<u8>),
 }
 
@@ -37,17 +39,19 @@ pub(super) struct Connection {
     pub(super) role: Role,
     pub(super) stream: TcpStream,
     out: VecDeque<u8>,
-    /// Kept back: when to send, what.
+    /// Bytes held back, with the time at which to send them.
     later: VecDeque<(u64, Vec<u8>)>,
     later_bytes: usize,
     blocked_since: Option<u64>,
     /// Close once everything is sent.
     pub(super) finishing: bool,
-    /// Why it is over.
+    /// Why the connection has ended.
     pub(super) over: Option<&'static str>,
-    /// Data packages left out because the client was slow.
+    /// Data packages skipped because the client did not keep up.
     pub(super) skipped: u64,
-    /// Counts data packages, for the fault that keeps one of many.
+    /// Time of the last read of a script port, ns.
+    pub(super) read_ns: u64,
+    /// Data packages so far, for the fault that sends only one of many.
     pub(super) counted: u32,
 }
 
@@ -55,7 +59,7 @@ impl Connection {
     pub(super) fn new(id: ClientId, port: Port, role: Role, stream: TcpStream) -> std::io::Result<Self> {
         stream.set_nonblocking(true)?;
         stream.set_nodelay(true)?;
-        // A small buffer, so that a client that stops reading is noticed in seconds and stale packages stay few.
+        // A small buffer: a client that stops reading is noticed within seconds, and few stale packages accumulate.
         rustix::net::sockopt::set_socket_send_buffer_size(&stream, 64 * 1024)?;
         Ok(Connection {
             id,
@@ -69,27 +73,28 @@ impl Connection {
             finishing: false,
             over: None,
             skipped: 0,
+            read_ns: 0,
             counted: 0,
         })
     }
 
-    /// Whether bytes wait to be written now.
+    /// Whether bytes are ready to be written.
     pub(super) fn wants_to_write(&self) -> bool {
         !self.out.is_empty()
     }
 
-    /// Sends bytes, subject to the faults of the wire.
+    /// Queues bytes, subject to the network faults, and writes what is due.
     pub(super) fn send(&mut self, bytes: &[u8], wire: &WireFaults, now_ns: u64, random: f64) {
         if now_ns < wire.mute_until {
             return;
         }
-        if self.out.len() + self.later_bytes + bytes.len() > MOST_WAITING {
-            self.over = Some("does not read what it asked for");
+        if self.out.len() + self.later_bytes + bytes.len() > MAX_QUEUED_BYTES {
+            self.over = Some("does not read: send queue full");
             return;
         }
         let at = now_ns + wire.delay_ns + (wire.jitter_ns as f64 * random) as u64;
         let at = at.max(wire.hold_until.min(now_ns.saturating_add(3_600_000_000_000)));
-        // The order of a stream stays, whatever the jitter.
+        // Jitter must not change the order of the stream.
         let at = self.later.back().map_or(at, |(last, _)| at.max(*last));
         if at > now_ns {
             self.later_bytes += bytes.len();
@@ -100,7 +105,7 @@ impl Connection {
         }
     }
 
-    /// Sends a data package, or leaves it out when earlier bytes still wait: the newest counts, not the queue.
+    /// Sends a data package, or skips it while earlier bytes are still queued: clients need the newest package, not all.
     pub(super) fn send_newest(&mut self, bytes: &[u8], wire: &WireFaults, now_ns: u64, random: f64) {
         if self.out.is_empty() {
             self.send(bytes, wire, now_ns, random);
@@ -109,7 +114,7 @@ impl Connection {
         }
     }
 
-    /// Writes what may be written now. Never blocks.
+    /// Writes what is due. Never blocks.
     pub(super) fn flush(&mut self, wire: &WireFaults, now_ns: u64) {
         while self.later.front().is_some_and(|(at, _)| *at <= now_ns) {
             if let Some((_, bytes)) = self.later.pop_front() {
@@ -130,8 +135,8 @@ impl Connection {
                 Err(e) if e.kind() == ErrorKind::Interrupted => continue,
                 Err(e) if e.kind() == ErrorKind::WouldBlock => {
                     let since = *self.blocked_since.get_or_insert(now_ns);
-                    // The other ports go on leaving out packages: SDU's client uploads through 30003 and never reads it.
-                    if self.port == Port::Rtde && now_ns.saturating_sub(since) > CUT_OFF_NS {
+                    // The other ports only skip packages: SDU's client uploads through 30003 and never reads from it.
+                    if self.port == Port::Rtde && now_ns.saturating_sub(since) > MAX_BLOCKED_NS {
                         self.over = Some("did not read for 10 s");
                     }
                 }
@@ -144,7 +149,7 @@ impl Connection {
         }
     }
 
-    /// Reads once. `None` when there is nothing, or the connection is over (then `over` says why).
+    /// Reads once. `None` if there is nothing to read or the connection has ended (then `over` holds the reason).
     pub(super) fn read<'b>(&mut self, buffer: &'b mut [u8]) -> Option<&'b [u8]> {
         match self.stream.read(buffer) {
             Ok(0) => self.over = Some("closed by the client"),
@@ -155,26 +160,26 @@ impl Connection {
         None
     }
 
-    /// When kept-back bytes become due.
+    /// Time at which held-back bytes become due.
     pub(super) fn next_due(&self) -> Option<u64> {
         self.later.front().map(|(at, _)| *at)
     }
 
-    /// Makes the close that follows a reset instead of an orderly end.
+    /// Makes the following close send RST instead of FIN.
     pub(super) fn reset(&mut self) {
-        // Without the option the close is an orderly one; nothing better can be done then.
+        // If the option cannot be set, the connection is closed with FIN.
         let _ = rustix::net::sockopt::set_socket_linger(&self.stream, Some(Duration::ZERO));
         self.over = Some("reset on command");
     }
 }
 
-/// Takes whole lines out of `buffer`; a line beyond `longest` bytes is an error.
-pub(super) fn lines(buffer: &mut Vec<u8>, bytes: &[u8], longest: usize) -> Result<Vec<String>, ()> {
+/// Takes complete lines out of `buffer`. A line of more than `max_bytes` is an error.
+pub(super) fn lines(buffer: &mut Vec<u8>, bytes: &[u8], max_bytes: usize) -> Result<Vec<String>, ()> {
     buffer.extend_from_slice(bytes);
     let mut found = Vec::new();
     while let Some(end) = buffer.iter().position(|b| *b == b'\n') {
         let line: Vec<u8> = buffer.drain(..=end).collect();
         found.push(String::from_utf8_lossy(&line).trim_end().to_owned());
     }
-    if buffer.len() > longest { Err(()) } else { Ok(found) }
+    if buffer.len() > max_bytes { Err(()) } else { Ok(found) }
 }

@@ -1,22 +1,22 @@
-//! The dashboard server's language: one line in, one line out.
+//! Commands of the dashboard server: one line in, one line out.
 
 use super::robot::Robot;
 use super::state::RuntimeState;
 use crate::plant::Generation;
 use crate::urscript::Popup;
 
-/// What a new connection is greeted with.
+/// First line of every connection.
 pub(super) const GREETING: &str = "Connected: Universal Robots Dashboard Server";
 
-/// An answer, and whether the connection ends with it.
+/// An answer, and whether the connection is closed after it.
 pub(super) struct Reply {
-    /// One line without its end.
+    /// One line without its newline.
     pub line: String,
     /// Close after sending.
     pub close: bool,
 }
 
-/// Carries out one command. Exactly one line is answered, whatever came in.
+/// Executes one command. The answer is exactly one line for any input.
 pub(super) fn answer(robot: &mut Robot, line: &str) -> Reply {
     let line = line.trim();
     let lower = line.to_ascii_lowercase();
@@ -127,7 +127,7 @@ fn outcome(done: bool, success: &str, command: &str) -> String {
     if done { success.to_owned() } else { format!("Failed to execute: {command}") }
 }
 
-/// What follows `command` and a space, in the spelling of the client.
+/// The argument after `command` and a space, in the client's spelling.
 fn argument<'a>(line: &'a str, lower: &str, command: &str) -> Option<&'a str> {
     let rest = lower.strip_prefix(command)?;
     (rest.is_empty() || rest.starts_with(' ')).then(|| line.get(command.len()..).unwrap_or("").trim())
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn an_emergency_stop_takes_the_power_and_needs_both_hands() {
+    fn an_emergency_stop_removes_power_and_must_be_released_before_power_on() {
         let mut r = robot();
         r.emergency_stop(false);
         pass(&mut r, 1.0);
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn every_line_gets_one_line() {
+    fn every_command_is_answered_by_one_line() {
         let mut r = robot();
         for line in
             ["", " ", "load", "load ../../etc/passwd", "loadx", "popup a\tb", "\u{0}", "é load", "play", "pause"]

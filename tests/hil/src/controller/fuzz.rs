@@ -1,5 +1,5 @@
-//! Noise into every parser of the controller's side. `GRASPD_FUZZ_CASES=2500000 cargo test --release -p graspd-hil --lib fuzz` runs
-//! 12.5 million cases; without it a few seconds' worth.
+//! Fuzzing of every parser of the controller. `GRASPD_FUZZ_CASES=2500000 cargo test --release -p graspd-hil --lib fuzz` runs
+//! 12.5 million cases; the default takes a few seconds.
 
 use super::command::Command;
 use super::connection::lines;
@@ -13,12 +13,12 @@ use crate::plant::Model;
 use crate::urscript::{Collector, Machine, Upload};
 use graspd_rt::rtde::{Field, Side};
 
-/// Cases of each parser.
+/// Number of cases per parser.
 fn cases(usual: u64) -> u64 {
     std::env::var("GRASPD_FUZZ_CASES").ok().and_then(|v| v.parse().ok()).unwrap_or(usual)
 }
 
-/// A generator whose run is the same everywhere.
+/// A reproducible random generator.
 struct Dice(u64);
 
 impl Dice {
@@ -40,8 +40,8 @@ impl Dice {
     fn noise(&mut self, most: usize) -> Vec<u8> {
         (0..self.below(most)).map(|_| self.next() as u8).collect()
     }
-    /// Flips, cuts, doubles or inserts a few bytes.
-    fn spoil(&mut self, bytes: &mut Vec<u8>) {
+    /// Flips, truncates, repeats or inserts a few bytes.
+    fn mutate(&mut self, bytes: &mut Vec<u8>) {
         for _ in 0..self.below(4) {
             let at = self.below(bytes.len() + 1);
             match self.below(5) {
@@ -76,7 +76,7 @@ fn robot() -> Robot {
     Robot::new(Setup::new(Model::by_name("ur5e").unwrap()))
 }
 
-/// The arm is where numbers are.
+/// Joint values are finite and the slider is in range.
 fn is_sane(robot: &Robot) {
     assert!(robot.truth.actual_q.iter().chain(&robot.truth.actual_qd).all(|v| v.is_finite()));
     assert!((0.0..=1.0).contains(&robot.slider));
@@ -88,7 +88,7 @@ fn put(out: &mut Vec<u8>, kind: u8, body: &[u8]) {
     out.extend_from_slice(body);
 }
 
-/// Packages that are nearly right.
+/// Almost valid packages.
 fn rtde_bytes(d: &mut Dice, names: &[String]) -> Vec<u8> {
     let mut out = Vec::new();
     for _ in 0..1 + d.below(3) {
@@ -109,19 +109,19 @@ fn rtde_bytes(d: &mut Dice, names: &[String]) -> Vec<u8> {
             _ => d.noise(40),
         };
         if d.one_in(3) {
-            d.spoil(&mut body);
+            d.mutate(&mut body);
         }
         let kind = *d.pick(&[86u8, 118, 77, 85, 85, 79, 73, 83, 80, 0, 200]);
         put(&mut out, kind, &body);
     }
     if d.one_in(8) {
-        d.spoil(&mut out);
+        d.mutate(&mut out);
     }
     out
 }
 
 #[test]
-fn rtde_takes_any_bytes_in_any_pieces() {
+fn rtde_handles_any_bytes_however_they_are_split() {
     let mut d = Dice(1);
     let names: Vec<String> = Field::all(Side::Input)
         .chain(Field::all(Side::Output))
@@ -130,19 +130,19 @@ fn rtde_takes_any_bytes_in_any_pieces() {
         .collect();
     let mut robot = robot();
     let faults = RtdeFaults::default();
-    // Two sessions of two controllers' books: one takes the bytes whole, the other in pieces, and both must answer the same.
+    // Two sessions: one receives the bytes at once, the other in pieces. Their answers must be equal.
     let (mut whole, mut cut) = (RtdeSession::new(1), RtdeSession::new(1));
-    let (mut books, mut other_books) = (Ownership::default(), Ownership::default());
+    let (mut owners, mut other_owners) = (Ownership::default(), Ownership::default());
     let (mut out, mut other_out) = (Vec::new(), Vec::new());
     let mut ended = 0u64;
     for case in 0..cases(60_000) {
         let bytes = rtde_bytes(&mut d, &names);
         out.clear();
         other_out.clear();
-        let end = whole.receive(&bytes, &mut robot, &mut books, &faults, &mut out, &mut |_| {});
+        let end = whole.receive(&bytes, &mut robot, &mut owners, &faults, &mut out, &mut |_| {});
         let mut other_end = Ok(());
         for piece in d.pieces(&bytes) {
-            other_end = cut.receive(piece, &mut robot, &mut other_books, &faults, &mut other_out, &mut |_| {});
+            other_end = cut.receive(piece, &mut robot, &mut other_owners, &faults, &mut other_out, &mut |_| {});
             if other_end.is_err() {
                 break;
             }
@@ -152,8 +152,8 @@ fn rtde_takes_any_bytes_in_any_pieces() {
         if end.is_err() || d.one_in(500) {
             ended += u64::from(end.is_err());
             (whole, cut) = (RtdeSession::new(1), RtdeSession::new(1));
-            books.release(1);
-            other_books.release(1);
+            owners.release(1);
+            other_owners.release(1);
         }
         if case % 64 == 0 {
             robot.step();
@@ -167,7 +167,7 @@ fn rtde_takes_any_bytes_in_any_pieces() {
 }
 
 #[test]
-fn the_dashboard_answers_any_line_with_one() {
+fn the_dashboard_answers_any_line_with_one_line() {
     let mut d = Dice(2);
     const WORDS: [&str; 24] = [
         "load",
@@ -208,7 +208,7 @@ fn the_dashboard_answers_any_line_with_one() {
             bytes.extend_from_slice(d.pick(&["\n", "\r\n", "", "\n\n"]).as_bytes());
         }
         if d.one_in(2) {
-            d.spoil(&mut bytes);
+            d.mutate(&mut bytes);
         }
         let found = lines(&mut rest, &bytes, 4096);
         let mut pieces = Ok(Vec::new());
@@ -237,8 +237,8 @@ fn the_dashboard_answers_any_line_with_one() {
     }
 }
 
-/// Words of the language, of which texts are thrown together.
-const SCRIPT: [&str; 72] = [
+/// Fragments from which programs are composed at random.
+const SCRIPT: [&str; 77] = [
     "def f():",
     "end",
     "\n",
@@ -293,6 +293,11 @@ const SCRIPT: [&str; 72] = [
     "protective_stop()",
     "socket_close()",
     "tool_contact()",
+    "s = struct(a=1, b=x)",
+    "s.a",
+    "s.b[0] = 2",
+    "force_mode(p[0,0,0,0,0,0], [1,1,1,0,0,0], [x, n, 3], 2, [1,1,1,1,1,1])",
+    "interpreter_mode()",
     "make_list(3)",
     "to_num(\"1\")",
     "(",
@@ -325,7 +330,7 @@ fn script_text(d: &mut Dice, bodies: &[&str]) -> Vec<u8> {
         }
     };
     if d.one_in(2) {
-        d.spoil(&mut text);
+        d.mutate(&mut text);
     }
     text
 }
@@ -338,7 +343,7 @@ const PROGRAMS: [&str; 4] = [
 ];
 
 #[test]
-fn script_ports_take_any_bytes_in_any_pieces() {
+fn script_ports_handle_any_bytes_however_they_are_split() {
     let mut d = Dice(3);
     let mut robot = robot();
     let (mut whole, mut cut) = (Collector::default(), Collector::default());
@@ -359,12 +364,12 @@ fn script_ports_take_any_bytes_in_any_pieces() {
         assert_eq!(found, pieces, "case {case}: {:?}", String::from_utf8_lossy(&bytes));
         for upload in found.unwrap_or_default() {
             match upload {
-                Upload::Program(text) => drop(robot.upload(&text)),
+                Upload::Program { text, first_line } => drop(robot.upload_at(&text, first_line)),
                 Upload::StopProgram => robot.stop_program(),
             }
         }
         if d.one_in(8) {
-            // A new connection; and a robot that is well again.
+            // A new connection and a recovered robot.
             (whole, cut) = (Collector::default(), Collector::default());
             robot.stop_program();
             (robot.safety, robot.popup) = (SafetyMode::Normal, None);
@@ -378,7 +383,7 @@ fn script_ports_take_any_bytes_in_any_pieces() {
 }
 
 #[test]
-fn the_interpreter_takes_any_text() {
+fn the_interpreter_handles_any_text() {
     let mut d = Dice(4);
     let mut robot = robot();
     let mut ran = 0u64;
@@ -398,7 +403,40 @@ fn the_interpreter_takes_any_text() {
 }
 
 #[test]
-fn the_control_port_takes_any_line() {
+fn interpreter_mode_handles_any_line() {
+    let mut d = Dice(6);
+    let mut robot = robot();
+    let mut accepted = 0u64;
+    for _ in 0..cases(30_000) {
+        if !robot.is_program_running() {
+            (robot.safety, robot.popup) = (SafetyMode::Normal, None);
+            robot.set_mode(RobotMode::Running);
+            robot.upload("interpreter_mode()\n");
+            robot.step();
+        }
+        let mut line = match d.below(4) {
+            0 => d
+                .pick(&["skipbuffer", "abort", "statelastexecuted", "clear_interpreter()", "end_interpreter()"])
+                .as_bytes()
+                .to_vec(),
+            _ => (0..1 + d.below(4)).map(|_| *d.pick(&SCRIPT)).collect::<Vec<_>>().join(" ").into_bytes(),
+        };
+        if d.one_in(3) {
+            d.mutate(&mut line);
+        }
+        let answer = robot.interpret(&String::from_utf8_lossy(&line));
+        accepted += u64::from(answer.starts_with("ack: "));
+        assert!(["ack: ", "state: ", "discard: "].iter().any(|a| answer.starts_with(a)), "{answer}");
+        if d.one_in(4) {
+            robot.step();
+            is_sane(&robot);
+        }
+    }
+    assert!(accepted > 0, "no line was accepted");
+}
+
+#[test]
+fn the_control_port_handles_any_line() {
     let mut d = Dice(5);
     const ORDERS: [&str; 16] = [
         r#"{"cmd":"ping"}"#,
@@ -429,7 +467,7 @@ fn the_control_port_takes_any_line() {
             bytes.splice(at..=at.min(bytes.len() - 1), number.bytes());
         }
         if d.one_in(3) {
-            d.spoil(&mut bytes);
+            d.mutate(&mut bytes);
         }
         bytes.push(b'\n');
         for line in lines(&mut rest, &bytes, 1 << 16).unwrap_or_default() {
@@ -440,7 +478,7 @@ fn the_control_port_takes_any_line() {
         }
         if case % 64 == 0 {
             world.step(case);
-            // Positions like 1e308 are taken for what they are; they must not end the program.
+            // Positions like 1e308 are accepted; they must not cause a panic.
             world = World::new(robot(), Some((0.5, 4.0)), None);
         }
         world.actions.clear();

@@ -1,53 +1,13 @@
-//! The robot as a script sees it.
+//! The robot as the host of the script interpreter.
 
 use super::message::MessageKind;
+use super::registers::Registers;
 use super::robot::Robot;
 use crate::plant::{self, pose_to_vector, vector_to_pose};
 use crate::urscript::{
-    Bank, Connect, Host, HostError, JointVector, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup, PoseVector,
-    Received, RobotView, Target, Value, WatchdogAction,
+    Bank, Connect, ForceMode, Host, HostError, JointVector, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup,
+    PoseVector, Received, Remote, RobotView, Target, Value, WatchdogAction,
 };
-use std::collections::HashMap;
-use std::io::{ErrorKind, Read, Write};
-use std::net::{TcpStream, ToSocketAddrs};
-use std::sync::mpsc::{Receiver, TryRecvError, channel};
-use std::time::Duration;
-
-/// Connections that a script may hold at a time.
-const MOST_SOCKETS: usize = 8;
-
-/// Connections opened by the running program.
-#[derive(Default)]
-pub(super) struct Sockets(HashMap<String, Socket>);
-
-enum Socket {
-    /// A helper thread connects, for two seconds at most.
-    Connecting(Receiver<Option<TcpStream>>),
-    Open(TcpStream),
-}
-
-impl Sockets {
-    pub(super) fn close_all(&mut self) {
-        self.0.clear();
-    }
-}
-
-/// Connects without ever making the control step wait.
-fn connect(address: &str, port: u16) -> Receiver<Option<TcpStream>> {
-    let (tell, hear) = channel();
-    let address = address.to_owned();
-    std::thread::spawn(move || {
-        let stream = (address.as_str(), port)
-            .to_socket_addrs()
-            .ok()
-            .and_then(|mut all| all.next())
-            .and_then(|a| TcpStream::connect_timeout(&a, Duration::from_secs(2)).ok())
-            .filter(|s| s.set_nonblocking(true).is_ok() && s.set_nodelay(true).is_ok());
-        // The script may have given up; then the connection closes here.
-        let _ = tell.send(stream);
-    });
-    hear
-}
 
 fn bit(kind: OutputKind, index: usize) -> u32 {
     let base = match kind {
@@ -81,7 +41,7 @@ impl Robot {
     }
 }
 
-/// Seconds of a call's `t`: `None` when it is not given.
+/// Duration `t` of a call, s; zero means that it was not given.
 fn given(t: f64) -> Option<f64> {
     (t > 0.0).then_some(t)
 }
@@ -103,6 +63,7 @@ impl Host for Robot {
             tcp_pose_target: pose_to_vector(&self.generator.tool_pose()),
             tcp_speed_actual: r.actual_tcp_speed,
             tcp_speed_target: self.generator.tool_velocity(),
+            target_waypoint: self.target_waypoint(),
             tcp_force: r.tcp_force,
             tcp_offset: self.tcp,
             payload_mass: self.payload.mass,
@@ -144,6 +105,10 @@ impl Host for Robot {
 
     fn motion_start(&mut self, motion: &Motion) -> Result<(), HostError> {
         self.motion_failure = None;
+        let blend = match *motion {
+            Motion::MoveJ { r, .. } | Motion::MoveL { r, .. } | Motion::MoveP { r, .. } | Motion::MoveC { r, .. } => r,
+            _ => 0.0,
+        };
         let (command, time) = match *motion {
             Motion::MoveJ { target, a, v, t, .. } => {
                 (plant::Motion::MoveJ { q: self.joints_of(&target)?, accel: a, speed: v, duration: t }, None)
@@ -175,7 +140,7 @@ impl Host for Robot {
                 (plant::Motion::StopL { decel: a, rot_decel: given(a_rot).unwrap_or(a) }, None)
             }
         };
-        self.generator.start(command);
+        self.generator.start_blended(command, blend);
         self.motion_left_s = time;
         Ok(())
     }
@@ -185,7 +150,7 @@ impl Host for Robot {
             return MotionStatus::Failed(text);
         }
         let done = match self.motion_left_s {
-            // Half a step of slack, so that a time of n steps takes n steps whatever its last bit says.
+            // Half a step of tolerance: a time of n steps must take n steps despite rounding.
             Some(left) => left <= self.dt * 0.5,
             None => self.generator.is_settled(),
         };
@@ -242,7 +207,7 @@ impl Host for Robot {
     }
 
     fn set_payload(&mut self, mass: f64, cog: Option<[f64; 3]>) -> Result<(), HostError> {
-        // The controller takes a little more than the data sheet's figure.
+        // The controller accepts slightly more than the data sheet's payload.
         if !(0.0..=self.setup.model.max_payload * 1.1).contains(&mass) {
             return Err(HostError::Refused(format!(
                 "set_payload: {mass} kg is outside 0 to {} kg",
@@ -281,64 +246,45 @@ impl Host for Robot {
         }
     }
 
+    fn force_mode(&mut self, mode: &ForceMode) -> Result<(), HostError> {
+        self.begin_force_mode(mode)
+    }
+
+    fn end_force_mode(&mut self) {
+        self.generator.set_force_control(None);
+    }
+
+    fn rpc_begin(&mut self, url: &str, body: &str) -> Result<u32, HostError> {
+        self.remote_calls.begin(url, body).map_err(HostError::Refused)
+    }
+
+    fn rpc_poll(&mut self, call: u32) -> Remote {
+        self.remote_calls.poll(call)
+    }
+
     fn call(&mut self, name: &str, arguments: &[Value]) -> Result<Value, HostError> {
         self.answer(name, arguments)
     }
 
     fn socket_connect(&mut self, name: &str, address: &str, port: u16) -> Connect {
-        let full = self.sockets.0.len() >= MOST_SOCKETS;
-        match self.sockets.0.get(name) {
-            Some(Socket::Open(_)) => Connect::Open,
-            Some(Socket::Connecting(hear)) => match hear.try_recv() {
-                Ok(Some(stream)) => {
-                    self.sockets.0.insert(name.to_owned(), Socket::Open(stream));
-                    Connect::Open
-                }
-                Err(TryRecvError::Empty) => Connect::Pending,
-                Ok(None) | Err(TryRecvError::Disconnected) => {
-                    self.sockets.0.remove(name);
-                    Connect::Failed
-                }
-            },
-            None if full => Connect::Failed,
-            None => {
-                self.sockets.0.insert(name.to_owned(), Socket::Connecting(connect(address, port)));
-                Connect::Pending
-            }
-        }
+        self.sockets.connect(name, address, port)
     }
 
     fn socket_close(&mut self, name: &str) {
-        self.sockets.0.remove(name);
+        self.sockets.close(name);
     }
 
     fn socket_send(&mut self, name: &str, bytes: &[u8]) -> bool {
-        let sent = match self.sockets.0.get_mut(name) {
-            Some(Socket::Open(stream)) => stream.write_all(bytes).is_ok(),
-            _ => false,
-        };
-        if !sent {
-            self.sockets.0.remove(name);
-        }
-        sent
+        self.sockets.send(name, bytes)
     }
 
     fn socket_receive(&mut self, name: &str) -> Received {
-        let Some(Socket::Open(stream)) = self.sockets.0.get_mut(name) else { return Received::Closed };
-        let mut buffer = [0; 4096];
-        match stream.read(&mut buffer) {
-            Ok(n) if n > 0 => Received::Bytes(buffer.iter().copied().take(n).collect()),
-            Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => Received::Nothing,
-            Ok(_) | Err(_) => {
-                self.sockets.0.remove(name);
-                Received::Closed
-            }
-        }
+        self.sockets.receive(name)
     }
 }
 
 impl Robot {
-    fn bank(&self, bank: Bank) -> &super::registers::Registers {
+    fn bank(&self, bank: Bank) -> &Registers {
         match bank {
             Bank::Input => &self.inputs,
             Bank::Output => &self.outputs,

@@ -1,4 +1,4 @@
-//! A mock controller on a thread of this process, for tests: real sockets, real time, an address of its own.
+//! A mock controller on a thread of this process, for tests: real sockets, real time, a separate loopback address.
 
 use super::command::Command;
 use super::record::Recorder;
@@ -23,13 +23,13 @@ pub struct Hosted {
     thread: Option<JoinHandle<Server>>,
 }
 
-/// What can fail with a hosted mock.
+/// Errors of a hosted mock.
 #[derive(Debug, thiserror::Error)]
 pub enum HostedError {
-    /// No port.
+    /// A port could not be opened.
     #[error(transparent)]
     Listen(#[from] ListenError),
-    /// No record, no control connection, or no thread.
+    /// The record, the control connection or the thread could not be created.
     #[error("mock controller: {0}")]
     Io(#[from] std::io::Error),
     /// The control port refused a command.
@@ -37,7 +37,7 @@ pub enum HostedError {
     Refused(String),
 }
 
-/// Counts the mocks of this process, for addresses.
+/// Mocks started by this process; part of their addresses.
 static COUNT: AtomicU32 = AtomicU32::new(0);
 
 impl Hosted {
@@ -47,7 +47,7 @@ impl Hosted {
     /// # Errors
     /// When the ports are taken or the record cannot be written.
     pub fn start(setup: Setup, limits: Option<(f64, f64)>, record: Option<PathBuf>) -> Result<Self, HostedError> {
-        // 127.64.0.0/10 by process and count: tests of several processes run side by side.
+        // 127.64.0.0/10 by process id and count, so that tests of several processes can run in parallel.
         let n = COUNT.fetch_add(1, Ordering::Relaxed);
         let mixed = std::process::id().wrapping_mul(61).wrapping_add(n);
         let address =
@@ -98,7 +98,7 @@ impl Hosted {
         }
     }
 
-    /// Stops the mock and gives back everything that was behind its sockets.
+    /// Stops the mock and returns its world.
     pub fn stop(mut self) -> Option<World> {
         self.join()
     }
@@ -107,7 +107,7 @@ impl Hosted {
         self.stop.store(true, Ordering::Relaxed);
         let mut world = self.thread.take()?.join().ok()?.world;
         if let Some(recorder) = world.recorder.take() {
-            // The caller reads the file next; what could not be written shows there as a short record.
+            // The caller reads the file next; a failed write shows there as a short record.
             let _ = recorder.finish();
         }
         Some(world)

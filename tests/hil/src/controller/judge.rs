@@ -1,49 +1,53 @@
-//! The oracle: judges what clients ask for and what the arm does, and remembers the worst of both.
+//! The judge, a test oracle: checks the set-points of clients and the motion of the arm against limits.
 //!
-//! It knows the register layout of the project's control script (set-points in float registers 24 to 29, mode word in integer
-//! register 24, heartbeat counter in 25) and nothing of the client's code. It is fed with every input package and every control step,
-//! live by the mock or later from its record.
+//! It knows the register layout of the project's control script (set-points in float registers 24 to 29, mode word in
+//! integer register 24, heartbeat counter in 25) and shares no code with the client. It receives every input package and
+//! every control step, live from the mock or later from the wire record.
 
 use crate::plant::Joints;
 use graspd_rt::rtde::{Field, Value};
 use serde::Serialize;
 
-/// Bounds that a client has promised, and those of the arm.
+/// Limits of the client and of the arm.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Limits {
-    /// Largest joint rate a client may ask for, rad/s.
+    /// Largest joint speed that a client may command, rad/s.
     pub rate: f64,
-    /// Largest change of a joint rate, rad/s^2; 1 % is allowed on top for rounding.
+    /// Largest joint acceleration that a client may command, rad/s^2; 1 % more is allowed for rounding.
     pub accel: f64,
-    /// Largest joint rates of the arm itself, rad/s.
+    /// Largest joint speeds of the arm, rad/s.
     pub arm_rate: Joints,
-    /// Joint positions either way, rad.
+    /// Largest absolute joint positions, rad.
     pub position: Joints,
-    /// Control step, s: cycles of a client are this far apart at least.
+    /// Control step, s: the shortest cycle of a client.
     pub step_s: f64,
 }
 
-/// Mode word that lets rates through.
+/// Mode word with which the script applies the rates.
 const MODE_VELOCITY: i32 = 1;
 /// First float register of the rates.
-const RATES: u16 = 24;
-const MODE: u16 = 24;
-const CYCLE: u16 = 25;
-/// A joint slower than this stands still, rad/s.
-const REST: f64 = 1e-3;
-/// Violations kept in words; all are counted.
-const KEPT: usize = 32;
+const RATES_REGISTER: u16 = 24;
+/// Integer register of the mode word.
+const MODE_REGISTER: u16 = 24;
+/// Integer register of the heartbeat counter.
+const CYCLE_REGISTER: u16 = 25;
+/// Joint speed below which a joint counts as at rest, rad/s.
+const MAX_REST_SPEED: f64 = 1e-3;
+/// Violations kept with their details; all are counted.
+const MAX_VIOLATIONS: usize = 32;
+/// Episodes kept; all are counted.
+const MAX_EPISODES: usize = 64;
 
-/// A broken rule.
+/// A violation of a rule.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Violation {
     /// CLOCK_MONOTONIC or virtual time, ns.
     pub at_ns: u64,
     /// Which rule.
     pub rule: Rule,
-    /// Joint, where one is meant.
+    /// Joint, if the rule applies to one.
     pub joint: Option<usize>,
-    /// The value that broke it, SI units; `None` when it was not a number.
+    /// The offending value, SI units; `None` for NaN and infinity.
     pub value: Option<f64>,
 }
 
@@ -53,67 +57,67 @@ pub struct Violation {
 pub enum Rule {
     /// A set-point is NaN or infinite.
     Finite,
-    /// A set-point above the rate limit.
+    /// A set-point exceeds the rate limit.
     Rate,
-    /// A set-point that changes too fast.
+    /// A set-point exceeds the acceleration limit.
     Accel,
-    /// Rates not zero while the mode word is not velocity.
+    /// Rates are not zero although the mode word is not velocity.
     ZeroUnlessVelocity,
-    /// The arm turned faster than it may.
+    /// A joint of the arm exceeded its speed limit.
     ArmRate,
     /// A joint left its range.
     ArmPosition,
 }
 
-/// One movement from leaving rest to rest again.
+/// One movement of the arm, from rest to rest.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Episode {
-    /// Left rest, ns.
+    /// Start of the movement, ns.
     pub moved_ns: u64,
-    /// The last cycle that a client sent before the arm rested, ns.
+    /// The last heartbeat of a client before the arm came to rest, ns.
     pub last_heartbeat_ns: u64,
-    /// Fastest joint speed of the episode, rad/s.
+    /// Largest joint speed, rad/s.
     pub peak_rate: f64,
-    /// At rest again, ns; 0 while moving.
+    /// End of the movement, ns; 0 while moving.
     pub rest_ns: u64,
 }
 
 impl Episode {
-    /// From the last cycle to rest, ns; `None` while the arm moves. After a client died this is the robot's own reaction:
-    /// watchdog and ramp.
+    /// Time from the last heartbeat to rest, ns; `None` while the arm moves. After a client was killed this is the reaction
+    /// time of watchdog and ramp.
     pub fn stop_ns(&self) -> Option<u64> {
         (self.rest_ns > 0).then(|| self.rest_ns.saturating_sub(self.last_heartbeat_ns))
     }
 }
 
-/// What was seen so far.
+/// Observations so far.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Summary {
     /// Control steps.
     pub steps: u64,
-    /// Input packages, all clients.
+    /// Input packages of all clients.
     pub inputs: u64,
-    /// Set-points among them.
+    /// Input packages that hold a set-point.
     pub setpoints: u64,
-    /// Broken rules, all.
+    /// Number of violations.
     pub limit_violations: u64,
-    /// The first broken rules.
+    /// The first violations.
     pub violations: Vec<Violation>,
-    /// Fastest rate asked for, rad/s.
+    /// Largest commanded joint speed, rad/s.
     pub max_setpoint_rate: f64,
-    /// Fastest change asked for, rad/s^2.
+    /// Largest commanded joint acceleration, rad/s^2.
     pub max_setpoint_accel: f64,
-    /// Fastest joint speed of the arm, rad/s.
+    /// Largest joint speed of the arm, rad/s.
     pub max_arm_rate: f64,
-    /// Fastest change of the arm's target speed, rad/s^2.
+    /// Largest target acceleration of the arm, rad/s^2.
     pub max_target_accel: f64,
-    /// Longest pause between two set-points while rates were not zero, ns.
+    /// Longest gap between two set-points while rates were not zero, ns.
     pub max_setpoint_gap_ns: u64,
-    /// Time of the newest cycle, ns.
+    /// Time of the newest heartbeat, ns.
     pub last_heartbeat_ns: u64,
-    /// Movements; the newest 64.
+    /// The newest movements.
     pub episodes: Vec<Episode>,
-    /// Movements in all.
+    /// Number of movements.
     pub episode_count: u64,
 }
 
@@ -124,7 +128,7 @@ struct Setpoint {
     cycle: i32,
 }
 
-/// The judge itself.
+/// Checks set-points and motion; see the module page.
 #[derive(Clone, Debug)]
 pub struct Judge {
     limits: Limits,
@@ -136,7 +140,7 @@ pub struct Judge {
     moving: Option<Episode>,
 }
 
-/// What a control step came to.
+/// The arm in one control step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StepSample {
     /// CLOCK_MONOTONIC or virtual time, ns.
@@ -157,7 +161,7 @@ impl Judge {
         Judge { limits, summary: Summary::default(), rates: [0.0; 6], mode: 0, cycle: 0, last: None, moving: None }
     }
 
-    /// The limits in force.
+    /// The present limits.
     pub fn limits(&self) -> &Limits {
         &self.limits
     }
@@ -167,20 +171,22 @@ impl Judge {
         (self.limits.rate, self.limits.accel) = (rate, accel);
     }
 
-    /// One input package of any client.
+    /// Checks one input package of any client.
     pub fn input(&mut self, at_ns: u64, values: &[(Field, Value)]) {
         self.summary.inputs += 1;
         let mut is_setpoint = false;
         for (field, value) in values {
             match (field.stem(), value) {
-                (("input_double_register_", Some(n)), Value::Double(v)) if (RATES..RATES + 6).contains(&n) => {
-                    if let Some(rate) = self.rates.get_mut(usize::from(n - RATES)) {
+                (("input_double_register_", Some(n)), Value::Double(v))
+                    if (RATES_REGISTER..RATES_REGISTER + 6).contains(&n) =>
+                {
+                    if let Some(rate) = self.rates.get_mut(usize::from(n - RATES_REGISTER)) {
                         *rate = *v;
                     }
                     is_setpoint = true;
                 }
-                (("input_int_register_", Some(MODE)), Value::Int32(v)) => self.mode = *v,
-                (("input_int_register_", Some(CYCLE)), Value::Int32(v)) => {
+                (("input_int_register_", Some(MODE_REGISTER)), Value::Int32(v)) => self.mode = *v,
+                (("input_int_register_", Some(CYCLE_REGISTER)), Value::Int32(v)) => {
                     if *v != self.cycle {
                         self.summary.last_heartbeat_ns = at_ns;
                     }
@@ -196,7 +202,7 @@ impl Judge {
 
     fn setpoint(&mut self, at_ns: u64) {
         self.summary.setpoints += 1;
-        // Outside velocity mode the script ignores the rates and ramps by itself: they count as zero.
+        // Outside velocity mode the script ignores the rates and decelerates: they count as zero.
         let moving = self.mode == MODE_VELOCITY;
         let rates = if moving { self.rates } else { [0.0; 6] };
         let now = Setpoint { at_ns, rates, cycle: self.cycle };
@@ -213,10 +219,10 @@ impl Judge {
             if v != 0.0 && !moving {
                 self.violate(at_ns, Rule::ZeroUnlessVelocity, Some(joint), v);
             }
-            // A client that has just connected finds an arm at rest: its first set-point counts from there.
+            // A client that has just connected finds the arm at rest, so its first set-point is compared with zero.
             let (from, last_heartbeat) = self.last.map_or((0.0, now.cycle), |l| (l.rates[joint], l.cycle));
             if moving && from.is_finite() {
-                // Cycles that were skipped leave room for more change; a heartbeat that stops is one step at least.
+                // Skipped cycles permit a larger change; a heartbeat that did not change counts as one step.
                 let cycles = f64::from(now.cycle.wrapping_sub(last_heartbeat).clamp(1, 1000));
                 let accel = (v - from).abs() / (cycles * limits.step_s);
                 self.summary.max_setpoint_accel = self.summary.max_setpoint_accel.max(accel);
@@ -232,12 +238,12 @@ impl Judge {
         self.last = Some(now);
     }
 
-    /// A client connects anew: its first set-point is compared with rest, not with the last one of the client before.
+    /// Notes a new client: its first set-point is compared with rest, not with the last one of the previous client.
     pub fn forget_client(&mut self) {
         self.last = None;
     }
 
-    /// One control step.
+    /// Checks one control step.
     pub fn step(&mut self, s: &StepSample) {
         self.summary.steps += 1;
         let mut fastest = 0.0f64;
@@ -253,7 +259,7 @@ impl Judge {
             }
         }
         self.summary.max_arm_rate = self.summary.max_arm_rate.max(fastest);
-        let at_rest = fastest < REST && s.target_qd.iter().all(|v| v.abs() < REST);
+        let at_rest = fastest < MAX_REST_SPEED && s.target_qd.iter().all(|v| v.abs() < MAX_REST_SPEED);
         match (&mut self.moving, at_rest) {
             (None, false) => {
                 self.moving = Some(Episode { moved_ns: s.at_ns, peak_rate: fastest, ..Episode::default() });
@@ -261,7 +267,7 @@ impl Judge {
             (Some(episode), false) => episode.peak_rate = episode.peak_rate.max(fastest),
             (Some(episode), true) => {
                 (episode.rest_ns, episode.last_heartbeat_ns) = (s.at_ns, self.summary.last_heartbeat_ns);
-                if self.summary.episodes.len() == 64 {
+                if self.summary.episodes.len() == MAX_EPISODES {
                     self.summary.episodes.remove(0);
                 }
                 self.summary.episodes.push(*episode);
@@ -274,13 +280,13 @@ impl Judge {
 
     fn violate(&mut self, at_ns: u64, rule: Rule, joint: Option<usize>, value: f64) {
         self.summary.limit_violations += 1;
-        if self.summary.violations.len() < KEPT {
+        if self.summary.violations.len() < MAX_VIOLATIONS {
             let value = value.is_finite().then_some(value);
             self.summary.violations.push(Violation { at_ns, rule, joint, value });
         }
     }
 
-    /// What was seen so far; a movement under way is the last episode, with `rest_ns` 0.
+    /// Observations so far; a movement under way is the last episode, with `rest_ns` 0.
     pub fn summary(&self) -> Summary {
         let mut summary = self.summary.clone();
         if let Some(mut episode) = self.moving {

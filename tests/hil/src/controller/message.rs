@@ -1,29 +1,29 @@
-//! What the controller has to say on the primary interface.
+//! Robot messages for the primary interface.
 
-/// Text of a message is cut to this many bytes.
-const LONGEST_TEXT: usize = 2048;
-/// Messages that wait for the next send; older ones are dropped first.
-const MOST_WAITING: usize = 256;
+/// Longest text of a message; longer ones are truncated.
+const MAX_TEXT_BYTES: usize = 2048;
+/// Queued messages; the oldest are dropped first.
+const MAX_QUEUED: usize = 256;
 
 /// One robot message.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Message {
     /// Controller time, microseconds.
     pub time_us: u64,
-    /// What it says.
+    /// Content.
     pub kind: MessageKind,
 }
 
-/// What a message says.
+/// Content of a message.
 #[derive(Clone, Debug, PartialEq)]
 pub enum MessageKind {
     /// `textmsg`.
     Text(String),
-    /// The program's position in words.
+    /// Label of the program node under way.
     Label(i32, String),
     /// `popup`.
     Popup {
-        /// Head line.
+        /// Title.
         title: String,
         /// Body.
         text: String,
@@ -49,7 +49,7 @@ pub enum MessageKind {
         argument: i32,
         /// 0 debug, 1 info, 2 warning, 3 violation, 4 fault.
         level: i32,
-        /// In words.
+        /// Description.
         text: String,
     },
     /// A program failed.
@@ -58,38 +58,38 @@ pub enum MessageKind {
         line: i32,
         /// Column, from 1.
         column: i32,
-        /// In words.
+        /// Description.
         text: String,
     },
 }
 
-/// Messages that wait to be sent, bounded.
+/// Messages to be sent, bounded.
 #[derive(Clone, Debug, Default)]
 pub struct Outbox(std::collections::VecDeque<Message>);
 
 impl Outbox {
     /// Adds a message, dropping the oldest when full.
     pub fn push(&mut self, time_us: u64, kind: MessageKind) {
-        if self.0.len() == MOST_WAITING {
+        if self.0.len() == MAX_QUEUED {
             self.0.pop_front();
         }
         self.0.push_back(Message { time_us, kind });
     }
 
-    /// Takes everything that waits.
+    /// Takes all messages.
     pub fn drain(&mut self) -> impl Iterator<Item = Message> + '_ {
         self.0.drain(..)
     }
 
-    /// Whether nothing waits.
+    /// Whether there is no message.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 }
 
-/// Cuts a text at a character boundary so that its length fits every frame.
+/// Truncates a text at a character boundary so that its length fits every frame.
 pub(super) fn cut(text: &str) -> &str {
-    let mut end = text.len().min(LONGEST_TEXT);
+    let mut end = text.len().min(MAX_TEXT_BYTES);
     while !text.is_char_boundary(end) {
         end -= 1;
     }

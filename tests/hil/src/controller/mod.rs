@@ -1,31 +1,40 @@
-//! A Universal Robots controller as its clients see it.
+//! A simulated Universal Robots controller.
 //!
-//! Layers, in the order a reader should learn them: [`Robot`] is the whole robot in memory, one control step a call; [`World`] adds
-//! the oracle ([`Judge`]), the wire record and the faults; [`Server`] puts it behind sockets. [`main_with_args`] is the program.
+//! Layers, in reading order: [`Robot`] is the robot in memory, one control step per call; [`World`] adds the test oracle
+//! ([`Judge`]), the wire record and the faults; [`Server`] puts it behind sockets. [`main_with_args`] is the program.
 //!
-//! The controller's half of the wire formats is written apart from the daemon's client, so that a mistake in one of them
-//! shows; only the table of variables is shared.
+//! The controller's side of the wire formats shares no code with the daemon's client, so that an error in one of them
+//! shows as a disagreement. Only the table of RTDE variables is shared.
 
 mod cli;
 mod command;
 mod connection;
+mod contact;
 mod dashboard;
+mod devices;
+mod force;
 #[cfg(test)]
 mod fuzz;
 mod host;
 mod hosted;
 mod judge;
 mod link_faults;
+mod measure;
+mod memory;
 mod message;
 mod primary;
 mod program;
+mod programs;
 mod questions;
 mod record;
 mod registers;
+mod remote_calls;
 mod report;
 mod robot;
 mod rtde_session;
+mod safety;
 mod server;
+mod sockets;
 mod state;
 mod variables;
 mod watchdog;
@@ -33,11 +42,12 @@ mod world;
 
 pub use cli::{Args, main_with_args};
 pub use command::{Command, Port, WireAction};
+pub use contact::ContactPlane;
 pub use hosted::{Hosted, HostedError};
 pub use judge::{Episode, Judge, Limits, Rule, StepSample, Summary, Violation};
 pub use link_faults::{RtdeFaults, WireFaults};
 pub use message::{Message, MessageKind, Outbox};
-pub use program::Upload;
+pub use programs::Upload;
 pub use record::{Entry, RecordError, Recorder, judge as judge_record, read as read_record};
 pub use registers::{Registers, Signals};
 pub use report::{Report, ReportFault};

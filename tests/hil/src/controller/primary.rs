@@ -1,4 +1,4 @@
-//! Packages of the primary and secondary interfaces: robot state, version message, robot messages.
+//! Packages of the primary, secondary and real-time interfaces.
 
 use super::message::{Message, MessageKind, cut};
 use super::robot::Robot;
@@ -22,7 +22,7 @@ mod part {
     pub(super) const CALIBRATION: u8 = 9;
 }
 
-/// A package under construction: nested lengths are filled in when a part ends.
+/// A package under construction; the length of a nested part is filled in when the part ends.
 #[derive(Default)]
 struct Writer(Vec<u8>);
 
@@ -68,7 +68,7 @@ impl Writer {
         self.0.extend_from_slice(v.as_bytes());
         self
     }
-    /// `i32 size, u8 kind, body`.
+    /// Writes `i32 size, u8 kind, body`.
     fn part(&mut self, kind: u8, body: impl FnOnce(&mut Writer)) -> &mut Self {
         let start = self.0.len();
         self.i32(0).u8(kind);
@@ -81,7 +81,7 @@ impl Writer {
     }
 }
 
-/// The version message that opens every primary and secondary connection.
+/// The version message, the first package of every primary and secondary connection.
 pub(super) fn version_message(robot: &Robot) -> Vec<u8> {
     let [major, minor, bugfix, build] = robot.setup.model.software();
     let mut w = Writer::default();
@@ -194,7 +194,7 @@ fn masterboard(w: &mut Writer, robot: &Robot) {
     });
 }
 
-/// The unit's own chain: a checksum a joint, then theta, a, d, alpha, then the status of the calibration (0: linear, done).
+/// Calibrated kinematics: one checksum per joint, then theta, a, d, alpha, then the calibration status (0: calibrated).
 fn kinematics(w: &mut Writer, robot: &Robot) {
     let rows = &robot.setup.kinematics.rows;
     w.part(part::KINEMATICS, |w| {
@@ -234,16 +234,16 @@ fn configuration(w: &mut Writer, robot: &Robot) {
     });
 }
 
-/// Length of the real-time package from software 5.10 on, bytes.
-const REALTIME_5_10: usize = 1220;
-/// Length from software 3.5 to 5.3.
-const REALTIME_3_5: usize = 1108;
+/// Length of the real-time package from software 5.10 on.
+const REALTIME_5_10_BYTES: usize = 1220;
+/// Length of the real-time package of software 3.5 to 5.3.
+const REALTIME_3_5_BYTES: usize = 1108;
 
-/// The one package of the real-time interface: a size, then doubles only.
+/// The package of the real-time interface: its size, then doubles only.
 pub(super) fn realtime(robot: &Robot) -> Vec<u8> {
     let size = match robot.setup.model.generation {
-        Generation::ESeries => REALTIME_5_10,
-        Generation::Cb3 => REALTIME_3_5,
+        Generation::ESeries => REALTIME_5_10_BYTES,
+        Generation::Cb3 => REALTIME_3_5_BYTES,
     };
     let r = &robot.report;
     let mut w = Writer(Vec::with_capacity(size));
@@ -295,7 +295,7 @@ mod tests {
 
     #[test]
     fn sub_packages_have_the_sizes_of_the_manual() {
-        // Sizes without the five bytes of the head: client interfaces manual, 3.5 and later.
+        // Sizes without the header of five bytes; source: client interfaces manual, 3.5 and later.
         let parts = parts(&robot_state(&robot("ur5e"), true));
         let size = |kind: u8| parts.iter().find(|p| p.0 == kind).map(|p| p.1.len());
         assert_eq!(size(part::ROBOT_MODE), Some(42));
@@ -308,20 +308,20 @@ mod tests {
     }
 
     #[test]
-    fn the_realtime_package_is_as_long_as_it_says() {
+    fn the_realtime_package_has_the_length_in_its_header() {
         for (model, size) in [("ur5e", 1220), ("ur5", 1108)] {
             let p = realtime(&robot(model));
             assert_eq!(p.len(), size);
             assert_eq!(i32::from_be_bytes(p[..4].try_into().unwrap()) as usize, size);
         }
-        // The runtime state stands where readers of 5.10 look for it: the 132nd double.
+        // In software 5.10 the runtime state is the 132nd double.
         let p = realtime(&robot("ur5e"));
         let at = 4 + 8 * 131;
         assert_eq!(f64::from_be_bytes(p[at..at + 8].try_into().unwrap()), 1.0);
     }
 
     #[test]
-    fn the_calibration_is_the_units_own() {
+    fn the_kinematics_part_holds_the_calibrated_values() {
         let mut setup = Setup::new(Model::by_name("ur5e").unwrap());
         setup.kinematics.rows[1].a -= 0.0011;
         let robot = Robot::new(setup);

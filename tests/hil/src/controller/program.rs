@@ -1,46 +1,27 @@
-//! Programs on the controller: upload, play, pause, stop, and their turn in each control step.
+//! Programs on the controller: upload, play, pause, stop, watchdogs, and their execution in each control step.
 
 use super::message::MessageKind;
+use super::programs::{MAX_SECONDARY, Upload};
 use super::robot::{PROGRAM_STOP_DECEL, Robot};
 use super::state::{RobotMode, RuntimeState};
 use crate::plant::Motion;
-use crate::urscript::{Machine, ProgramKind, StepOutcome};
-
-/// Programs side by side (`sec`); more are refused.
-const MOST_SECONDARY: usize = 8;
-
-/// The main program and those beside it.
-#[derive(Default)]
-pub(super) struct Programs {
-    main: Option<Machine>,
-    /// Whether the main program is under way; false as soon as it is ended, even from inside its own step.
-    active: bool,
-    secondary: Vec<Machine>,
-    /// Name and text of the program that `play` starts.
-    loaded: Option<(String, String)>,
-}
-
-/// What became of a text sent to ports 30001 to 30003.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Upload {
-    /// It replaces the main program.
-    Main,
-    /// It runs beside the main program.
-    Secondary,
-    /// Refused, with the reason that the robot shows.
-    Refused(String),
-}
+use crate::urscript::{Machine, ProgramKind, StepOutcome, WatchdogAction, no_program};
 
 impl Robot {
-    /// Whether the main program is playing: bit 1 of `robot_status_bits`.
+    /// Whether the main program is running: bit 1 of `robot_status_bits`.
     pub fn is_program_running(&self) -> bool {
         matches!(self.runtime, RuntimeState::Playing | RuntimeState::Resuming)
     }
 
-    /// Takes a script as ports 30001 to 30003 do: `def` replaces the main program, `sec` runs beside it, a bare line is a
-    /// program of one line.
+    /// Takes a script as ports 30001 to 30003 do: `def` replaces the main program, `sec` runs as a secondary program, a bare
+    /// line is a program of one line.
     pub fn upload(&mut self, text: &str) -> Upload {
-        let machine = match Machine::load(text) {
+        self.upload_at(text, 1)
+    }
+
+    /// Like [`Robot::upload`] for a text that begins at line `first_line` of what the client sent.
+    pub fn upload_at(&mut self, text: &str, first_line: u32) -> Upload {
+        let machine = match Machine::load_at(text, first_line) {
             Ok(machine) => machine,
             Err(e) => {
                 self.say(MessageKind::Runtime { line: e.line as i32, column: 1, text: e.message.clone() });
@@ -48,7 +29,7 @@ impl Robot {
             }
         };
         if machine.kind() == ProgramKind::Secondary {
-            if self.programs.secondary.len() >= MOST_SECONDARY {
+            if self.programs.secondary.len() >= MAX_SECONDARY {
                 return Upload::Refused("too many secondary programs".to_owned());
             }
             self.programs.secondary.push(machine);
@@ -68,7 +49,15 @@ impl Robot {
         Upload::Main
     }
 
-    /// Loads `NAME.urp`, that is `NAME.script` of the program directory; false when there is none.
+    /// Answers one line of the interpreter port.
+    pub fn interpret(&mut self, line: &str) -> String {
+        let Some(mut main) = self.programs.main.take() else { return no_program(line) };
+        let answer = main.interpret(line, self);
+        self.programs.main = Some(main);
+        answer
+    }
+
+    /// Loads `NAME.urp`, i.e. `NAME.script` of the program directory; false if there is none.
     pub fn load_program(&mut self, name: &str) -> bool {
         let stem = name.trim().trim_end_matches(".urp");
         if stem.is_empty() || stem.contains(['/', '\\']) || stem.starts_with('.') {
@@ -89,7 +78,7 @@ impl Robot {
         self.programs.loaded.as_ref().map(|(name, _)| name.as_str())
     }
 
-    /// Starts the loaded program, or lets a paused one go on; false when neither can be.
+    /// Starts the loaded program or resumes a paused one; false if neither is possible.
     pub fn play(&mut self) -> bool {
         if self.mode != RobotMode::Running || !self.safety.allows_motion() {
             return false;
@@ -103,7 +92,7 @@ impl Robot {
         self.upload(&text) == Upload::Main
     }
 
-    /// Pauses the program; the arm comes to rest on its path. False when none plays.
+    /// Pauses the program; the arm comes to rest on its path. False if no program is running.
     pub fn pause_program(&mut self) -> bool {
         let playing = self.is_program_running();
         if playing {
@@ -119,10 +108,12 @@ impl Robot {
         }
     }
 
-    /// Ends the main program: its motion, its watchdogs, its sockets.
+    /// Ends the main program, its motion, its watchdogs and its sockets.
     pub(super) fn end_program(&mut self) {
         self.watchdogs.clear();
         self.sockets.close_all();
+        self.remote_calls.clear();
+        self.generator.set_force_control(None);
         (self.motion_left_s, self.motion_failure) = (None, None);
         self.programs.main = None;
         if std::mem::take(&mut self.programs.active) {
@@ -131,13 +122,13 @@ impl Robot {
         }
     }
 
-    /// One step of every program.
+    /// Runs one control step of every program.
     pub(super) fn run_programs(&mut self) {
         if self.is_program_running()
             && let Some(mut main) = self.programs.main.take()
         {
             let outcome = main.step(self);
-            // The step may itself have ended the program (a protective stop): then it does not come back.
+            // The step itself may have ended the program, for example by a protective stop.
             if self.programs.active {
                 self.programs.main = Some(main);
                 self.conclude(outcome);
@@ -166,13 +157,30 @@ impl Robot {
         }
     }
 
-    /// `Stopping` and `Pausing` end when the arm rests.
+    /// Ends `Stopping` and `Pausing` once the arm is at rest.
     pub(super) fn settle_runtime(&mut self) {
         let rest = self.generator.at_rest();
         match self.runtime {
             RuntimeState::Stopping if rest => self.runtime = RuntimeState::Stopped,
             RuntimeState::Pausing if rest => self.runtime = RuntimeState::Paused,
             _ => {}
+        }
+    }
+
+    /// Pauses or stops the program if a watched input was not written in time.
+    pub(super) fn check_watchdogs(&mut self) {
+        if self.deaf_watchdog || !self.is_program_running() {
+            return;
+        }
+        let Some((input, action)) = self.watchdogs.expired(self.clock_s) else { return };
+        let text = format!("RTDE watchdog: input '{input}' was not written in time");
+        self.say(MessageKind::Runtime { line: 0, column: 0, text });
+        match action {
+            WatchdogAction::Stop => self.stop_program(),
+            WatchdogAction::Pause => {
+                self.pause_program();
+            }
+            WatchdogAction::Ignore => {}
         }
     }
 }

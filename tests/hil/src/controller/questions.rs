@@ -1,43 +1,7 @@
-//! Functions of the script language that only ask the controller: history, contact, limits, temperatures.
+//! Script functions that query the controller: history, contact, limits, temperatures, flags.
 
 use super::robot::Robot;
-use crate::plant::Joints;
 use crate::urscript::{Host, HostError, KinematicsQuery, Value};
-use std::collections::VecDeque;
-
-/// Control steps kept for `get_actual_joint_positions_history`: two seconds at 500 Hz.
-const HISTORY: usize = 1000;
-/// A force at the tool that counts as contact, N.
-const CONTACT_N: f64 = 5.0;
-
-/// What scripts may ask about the past, and small states that only scripts know.
-#[derive(Clone, Debug, Default)]
-pub(super) struct Memory {
-    /// Measured joint positions, newest last.
-    history: VecDeque<Joints>,
-    /// Control steps since the tool touched something; 0 while it touches nothing.
-    contact_steps: u32,
-    /// `set_flag`.
-    flags: u32,
-    random: u64,
-}
-
-impl Memory {
-    /// One control step passed.
-    pub(super) fn note(&mut self, q: &Joints, force: &[f64; 6]) {
-        if self.history.len() == HISTORY {
-            self.history.pop_front();
-        }
-        self.history.push_back(*q);
-        let touching = force.iter().take(3).map(|f| f * f).sum::<f64>().sqrt() > CONTACT_N;
-        self.contact_steps = if touching { self.contact_steps.saturating_add(1) } else { 0 };
-    }
-
-    fn random(&mut self) -> f64 {
-        self.random = self.random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (self.random >> 11) as f64 / (1u64 << 53) as f64
-    }
-}
 
 fn refused(text: impl Into<String>) -> HostError {
     HostError::Refused(text.into())
@@ -53,29 +17,34 @@ fn whole(v: Option<&Value>, limit: usize) -> Option<usize> {
 }
 
 impl Robot {
-    /// Answers a function of the script that moves nothing.
+    /// Evaluates a query function of a script.
     ///
     /// # Errors
-    /// Unknown names, and arguments that the function does not take.
+    /// The name is unknown or an argument is invalid.
     pub(super) fn answer(&mut self, name: &str, a: &[Value]) -> Result<Value, HostError> {
+        if let Some(answer) = self.devices.answer(name, a) {
+            return answer;
+        }
         let bad = |what: &str| refused(format!("{name}: {what}"));
         Ok(match name {
             "get_actual_joint_positions_history" => {
-                let back = whole(a.first(), usize::MAX).ok_or_else(|| bad("a number of steps from 0 on is needed"))?;
-                // The manual: steps beyond what is kept give the oldest that is.
+                let back = whole(a.first(), usize::MAX).ok_or_else(|| bad("expected a number of steps, at least 0"))?;
+                // Script manual: beyond the history the oldest sample is returned.
                 let at = self.memory.history.len().saturating_sub(1).saturating_sub(back);
                 Value::floats(&self.memory.history.get(at).copied().unwrap_or(self.truth.actual_q))
             }
             "get_target_joint_accelerations" => Value::floats(&self.truth.target_qdd),
             "get_target_payload_inertia" => Value::floats(&self.payload.inertia),
-            "is_within_safety_limits" => Value::Bool(self.within_limits(a).ok_or_else(|| bad("a pose or six joints"))?),
+            "is_within_safety_limits" => {
+                Value::Bool(self.within_limits(a).ok_or_else(|| bad("expected a pose or six joint positions"))?)
+            }
             "tool_contact" => {
                 let force = self.truth.tcp_force;
                 let along = match a.first() {
                     None | Some(Value::None) => None,
-                    some => Some(six(some).ok_or_else(|| bad("the direction is a pose or six numbers"))?),
+                    some => Some(six(some).ok_or_else(|| bad("the direction must be a pose or six numbers"))?),
                 };
-                // A direction asks for contact that opposes a motion that way; none, or zero, asks for any.
+                // With a direction only contact opposing a motion in that direction counts; without one (or zero) any.
                 let opposes = along.is_none_or(|d| {
                     let dot: f64 = d.iter().zip(&force).take(3).map(|(d, f)| d * f).sum();
                     d.iter().take(3).all(|v| *v == 0.0) || dot < 0.0
@@ -83,7 +52,7 @@ impl Robot {
                 let steps = if opposes { self.memory.contact_steps } else { 0 };
                 Value::Int(i32::try_from(steps).unwrap_or(i32::MAX))
             }
-            // 0 normal, 1 near a singularity, 2 too near.
+            // 0 normal, 1 close to a singularity, 2 too close.
             "get_freedrive_status" => Value::Int(0),
             "get_joint_temp" => {
                 let joint = whole(a.first(), 6).ok_or_else(|| bad("joints are numbered 0 to 5"))?;
@@ -98,16 +67,55 @@ impl Robot {
             }
             "set_flag" => {
                 let n = whole(a.first(), 32).ok_or_else(|| bad("flags are numbered 0 to 31"))?;
-                let Some(Value::Bool(on)) = a.get(1) else { return Err(bad("a boolean is needed")) };
+                let Some(Value::Bool(on)) = a.get(1) else { return Err(bad("expected a boolean")) };
                 self.memory.flags = self.memory.flags & !(1 << n) | u32::from(*on) << n;
                 Value::None
             }
             "random" => Value::Float(self.memory.random()),
+            _ => return self.configure(name, a),
+        })
+    }
+
+    /// Executes a setting of a script.
+    ///
+    /// # Errors
+    /// The name is unknown or an argument is invalid.
+    fn configure(&mut self, name: &str, a: &[Value]) -> Result<Value, HostError> {
+        let bad = |what: &str| refused(format!("{name}: {what}"));
+        Ok(match name {
+            "zero_ftsensor" => {
+                self.zero_force_sensor();
+                Value::None
+            }
+            "force_mode_set_gain_scaling" => {
+                let scaling = a.first().and_then(Value::as_f64).filter(|s| (0.0..=2.0).contains(s));
+                self.generator.set_force_gain(scaling.ok_or_else(|| bad("the scaling must be from 0 to 2"))?);
+                Value::None
+            }
+            // The simulated contact is damped enough; the value is only checked.
+            "force_mode_set_damping" => {
+                let damping = a.first().and_then(Value::as_f64).filter(|d| (0.0..=1.0).contains(d));
+                damping.ok_or_else(|| bad("the damping must be from 0 to 1"))?;
+                Value::None
+            }
+            "set_tool_voltage" => {
+                let voltage = whole(a.first(), 25).filter(|v| [0, 12, 24].contains(v));
+                self.signals.tool_voltage = voltage.ok_or_else(|| bad("the voltage must be 0, 12 or 24"))? as i32;
+                Value::None
+            }
+            "get_standard_analog_out" | "get_analog_out" => {
+                let n = whole(a.first(), 2).ok_or_else(|| bad("outputs are numbered 0 and 1"))?;
+                Value::Float(self.signals.analog_out[n])
+            }
+            "powerdown" => {
+                self.power_off();
+                Value::None
+            }
             _ => return Err(HostError::UnknownFunction(name.to_owned())),
         })
     }
 
-    /// Whether joints, or a pose by its nearest solution, lie inside the joint limits.
+    /// Whether joint positions, or the nearest solution for a pose, are within the joint limits.
     fn within_limits(&self, a: &[Value]) -> Option<bool> {
         let limit = self.setup.model.position_limit();
         let q = match a.first()? {

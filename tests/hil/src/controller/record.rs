@@ -1,9 +1,9 @@
-//! The wire record: every input package with its receive time, every control step, in one compact file.
+//! The wire record: every input package with its receive time and every control step in one binary file.
 //!
-//! Layout, all little-endian. The file begins with the eight bytes `URWIRE01`. Then records, each a kind byte and a body of a
-//! length that follows from it:
+//! Little-endian. The file begins with the eight bytes `URWIRE01`. Records follow, each a kind byte and a body whose length
+//! follows from the kind:
 //!
-//! - `I` input package: u64 receive time ns, u64 client, u8 count, then for each field u16 number (RTDE input list) and u8 length
+//! - `I` input package: u64 receive time ns, u64 client, u8 count, then for each field u16 number (RTDE input list), u8 length
 //!   and the value's bytes as on the wire.
 //! - `S` control step: u64 time ns, f64 controller time, six f64 each of target position, target speed, position, speed (rad,
 //!   rad/s), u8 robot mode, u8 safety mode, u8 runtime state.
@@ -20,17 +20,17 @@ use std::path::{Path, PathBuf};
 use std::thread::JoinHandle;
 
 const MAGIC: &[u8; 8] = b"URWIRE01";
-/// Blocks that may wait for the disk; beyond that the control step would wait, so they are dropped and counted.
-const QUEUE: usize = 1024;
-/// Bytes a block gathers before it is handed over.
-const BLOCK: usize = 16 * 1024;
+/// Blocks queued for the disk; further ones are dropped and counted, because the control step must not wait.
+const MAX_QUEUED_BLOCKS: usize = 1024;
+/// Size at which a block is queued.
+const BLOCK_BYTES: usize = 16 * 1024;
 
-/// Writes the record on a thread of its own.
+/// Writes the record on a separate thread.
 pub struct Recorder {
     block: Vec<u8>,
-    tell: Option<Sender<Vec<u8>>>,
+    queue: Option<Sender<Vec<u8>>>,
     writer: Option<JoinHandle<std::io::Result<()>>>,
-    /// Blocks lost because the disk was slow.
+    /// Blocks dropped because the disk was too slow.
     pub dropped: u64,
 }
 
@@ -39,19 +39,24 @@ impl Recorder {
     pub fn create(path: &Path) -> std::io::Result<Self> {
         let mut file = BufWriter::new(std::fs::File::create(path)?);
         file.write_all(MAGIC)?;
-        let (tell, hear): (Sender<Vec<u8>>, Receiver<Vec<u8>>) = bounded(QUEUE);
+        let (queue, blocks): (Sender<Vec<u8>>, Receiver<Vec<u8>>) = bounded(MAX_QUEUED_BLOCKS);
         let writer = std::thread::Builder::new().name("record".to_owned()).spawn(move || {
-            for block in hear {
+            for block in blocks {
                 file.write_all(&block)?;
-                // A reader that looks while the mock runs sees whole blocks.
+                // The file can be read while the mock runs.
                 file.flush()?;
             }
             file.flush()
         })?;
-        Ok(Recorder { block: Vec::with_capacity(2 * BLOCK), tell: Some(tell), writer: Some(writer), dropped: 0 })
+        Ok(Recorder {
+            block: Vec::with_capacity(2 * BLOCK_BYTES),
+            queue: Some(queue),
+            writer: Some(writer),
+            dropped: 0,
+        })
     }
 
-    /// Notes one input package.
+    /// Records one input package.
     pub fn input(&mut self, at_ns: u64, package: &InputPackage) {
         self.block.push(b'I');
         self.block.extend_from_slice(&at_ns.to_le_bytes());
@@ -64,10 +69,10 @@ impl Recorder {
             self.block.push(n as u8);
             self.block.extend_from_slice(&bytes[..n]);
         }
-        self.hand_over(BLOCK);
+        self.queue_block(BLOCK_BYTES);
     }
 
-    /// Notes one control step.
+    /// Records one control step.
     pub fn step(&mut self, at_ns: u64, robot: &Robot) {
         self.block.push(b'S');
         self.block.extend_from_slice(&at_ns.to_le_bytes());
@@ -79,38 +84,38 @@ impl Recorder {
             }
         }
         self.block.extend_from_slice(&[robot.mode as u8, robot.safety as u8, robot.runtime as u8]);
-        self.hand_over(BLOCK);
+        self.queue_block(BLOCK_BYTES);
     }
 
-    /// Notes an event in words.
+    /// Records an event.
     pub fn note(&mut self, at_ns: u64, text: &str) {
         let text = super::message::cut(text);
         self.block.push(b'N');
         self.block.extend_from_slice(&at_ns.to_le_bytes());
         self.block.extend_from_slice(&(text.len() as u16).to_le_bytes());
         self.block.extend_from_slice(text.as_bytes());
-        self.hand_over(BLOCK);
+        self.queue_block(BLOCK_BYTES);
     }
 
-    /// Hands everything over to the writer now.
+    /// Queues everything for writing.
     pub fn flush(&mut self) {
-        self.hand_over(1);
+        self.queue_block(1);
     }
 
-    fn hand_over(&mut self, from: usize) {
-        if self.block.len() < from {
+    fn queue_block(&mut self, min_bytes: usize) {
+        if self.block.len() < min_bytes {
             return;
         }
-        let block = std::mem::replace(&mut self.block, Vec::with_capacity(2 * BLOCK));
-        if self.tell.as_ref().is_none_or(|t| t.try_send(block).is_err()) {
+        let block = std::mem::replace(&mut self.block, Vec::with_capacity(2 * BLOCK_BYTES));
+        if self.queue.as_ref().is_none_or(|t| t.try_send(block).is_err()) {
             self.dropped += 1;
         }
     }
 
-    /// Writes what is left and closes the file.
+    /// Writes the rest and closes the file.
     pub fn finish(mut self) -> std::io::Result<()> {
         self.flush();
-        self.tell = None;
+        self.queue = None;
         match self.writer.take().map(JoinHandle::join) {
             Some(Ok(result)) => result,
             _ => Ok(()),
@@ -118,7 +123,7 @@ impl Recorder {
     }
 }
 
-/// One record as read back.
+/// One record, as read from a file.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Entry {
     /// An input package.
@@ -132,7 +137,7 @@ pub enum Entry {
     },
     /// A control step.
     Step {
-        /// When it was done, ns.
+        /// Time, ns.
         at_ns: u64,
         /// Controller time, s.
         clock_s: f64,
@@ -141,30 +146,30 @@ pub enum Entry {
         /// Robot mode, safety mode, runtime state.
         modes: [u8; 3],
     },
-    /// An event in words.
+    /// An event.
     Note {
-        /// When, ns.
+        /// Time, ns.
         at_ns: u64,
-        /// What.
+        /// Description.
         text: String,
     },
 }
 
-/// A record that cannot be read.
+/// A record could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    /// No such file, or no access.
+    /// The file cannot be read.
     #[error("wire record {0}: {1}")]
     Io(PathBuf, std::io::Error),
-    /// Not a record, or not of this version.
+    /// The file is not a wire record, or of another version.
     #[error("wire record {0}: does not begin with URWIRE01; record it again with this graspd-mock-ur")]
     Magic(PathBuf),
-    /// A record of unknown kind.
-    #[error("wire record {0}: no record of kind {1} is known (byte {2}); the file is damaged from there on")]
+    /// A record has an unknown kind.
+    #[error("wire record {0}: unknown record kind {1} at byte {2}; the file is damaged from there on")]
     Kind(PathBuf, u8, usize),
 }
 
-/// Reads a record. A last entry that is cut off (the writer was killed) is left out.
+/// Reads a record. A truncated last entry (the mock was killed) is ignored.
 pub fn read(path: &Path) -> Result<Vec<Entry>, RecordError> {
     let mut bytes = Vec::new();
     std::fs::File::open(path)
@@ -190,7 +195,7 @@ pub fn read(path: &Path) -> Result<Vec<Entry>, RecordError> {
     Ok(entries)
 }
 
-/// Judges a whole record.
+/// Judges a record.
 pub fn judge(entries: &[Entry], limits: Limits) -> Summary {
     let mut judge = Judge::new(limits);
     let mut last_qd = [0.0; 6];

@@ -1,9 +1,9 @@
-//! Registers and signals that clients, scripts and the outside world share.
+//! General-purpose registers and I/O signals.
 
-/// Integer and float registers of one direction.
+/// Number of integer and of float registers per direction.
 pub(super) const REGISTERS: usize = 48;
 
-/// One direction's general-purpose registers.
+/// General-purpose registers of one direction.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Registers {
     /// Boolean registers 0 to 127, one bit each.
@@ -21,12 +21,12 @@ impl Default for Registers {
 }
 
 impl Registers {
-    /// Bits `32 * word` to `32 * word + 31`.
+    /// Boolean registers `32 * word` to `32 * word + 31`.
     pub fn word(&self, word: usize) -> u32 {
         (self.bits >> (32 * word.min(3))) as u32
     }
 
-    /// Replaces those bits.
+    /// Sets boolean registers `32 * word` to `32 * word + 31`.
     pub fn set_word(&mut self, word: usize, value: u32) {
         let shift = 32 * word.min(3);
         self.bits = self.bits & !(0xffff_ffff_u128 << shift) | u128::from(value) << shift;
@@ -37,7 +37,7 @@ impl Registers {
         i < 128 && self.bits >> i & 1 == 1
     }
 
-    /// Sets one boolean register; nothing beyond 127.
+    /// Sets one boolean register; ignores numbers beyond 127.
     pub fn set_bit(&mut self, i: usize, value: bool) {
         if i < 128 {
             self.bits = self.bits & !(1 << i) | u128::from(value) << i;
@@ -45,7 +45,7 @@ impl Registers {
     }
 }
 
-/// Digital and analog signals of box and tool.
+/// Digital and analog signals of the control box and the tool.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Signals {
     /// Digital inputs: 0..7 standard, 8..15 configurable, 16 and 17 tool.
@@ -63,7 +63,7 @@ pub struct Signals {
 }
 
 impl Signals {
-    /// Sets the outputs named by `mask` (from bit `shift` on) to `values`.
+    /// Sets the outputs selected by `mask` (starting at bit `shift`) to `values`.
     pub fn set_outputs(&mut self, shift: u32, mask: u8, values: u8) {
         let (mask, values) = (u64::from(mask) << shift, u64::from(values) << shift);
         self.digital_out = self.digital_out & !mask | values & mask;
@@ -75,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn words_and_bits_are_the_same_registers() {
+    fn words_and_bits_access_the_same_registers() {
         let mut r = Registers::default();
         r.set_word(1, 0x8000_0001);
         assert!(r.bit(32) && r.bit(63) && !r.bit(33));
@@ -86,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mask_keeps_what_it_does_not_name() {
+    fn outputs_outside_the_mask_are_kept() {
         let mut s = Signals { digital_out: 0b1010, ..Signals::default() };
         s.set_outputs(0, 0b0011, 0b0001);
         assert_eq!(s.digital_out, 0b1001);

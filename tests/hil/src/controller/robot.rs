@@ -1,47 +1,55 @@
-//! The whole robot in memory: arm, safety, program, registers. No socket, no clock: [`Robot::step`] is one control step.
+//! The robot in memory: arm, safety, programs, registers. No servers and no clock: [`Robot::step`] is one control step.
 
+use super::contact::ContactPlane;
+use super::devices::Devices;
+use super::memory::Memory;
 use super::message::{MessageKind, Outbox};
-use super::program::Programs;
+use super::programs::Programs;
 use super::registers::{Registers, Signals};
+use super::remote_calls::RemoteCalls;
 use super::report::{Report, ReportFault};
+use super::sockets::Sockets;
 use super::state::{RobotMode, RuntimeState, SafetyMode};
 use super::watchdog::Watchdogs;
 use crate::plant::{Drives, Generator, Joints, Kinematics, Model, StopCause};
 use crate::urscript::Popup;
 use nalgebra::Isometry3;
 
-/// Acceleration that the drives can give, rad/s^2.
-const DRIVE_ACCEL: f64 = 80.0;
-/// Deviation of a joint from its target that stops the arm, rad: Universal Robots' position tolerance of 5 degrees.
-const PATH_TOLERANCE: f64 = 0.087;
-/// Deceleration when a program ends or is stopped, rad/s^2: the same as the stop in Universal Robots' control script.
+/// Largest acceleration of the drives, rad/s^2.
+const MAX_DRIVE_ACCEL: f64 = 80.0;
+/// Largest deviation of a joint from its target before a protective stop, rad: UR's position tolerance of 5 degrees.
+const MAX_PATH_DEVIATION_RAD: f64 = 0.087;
+/// Deceleration when a program ends or is stopped, rad/s^2: that of the stop in UR's own control script.
 pub const PROGRAM_STOP_DECEL: f64 = 4.0;
 
-/// What a robot is when it starts.
+/// Message for a joint number that is out of range.
+pub(super) const JOINT_NUMBERS: &str = "joints are numbered 0 to 5";
+
+/// Initial configuration of a robot.
 #[derive(Clone, Debug)]
 pub struct Setup {
-    /// Which arm.
+    /// Arm model.
     pub model: Model,
-    /// Its true kinematics; the model's nominal ones unless a unit's calibration is given.
+    /// True kinematics: the model's nominal ones, or the calibration of one unit.
     pub kinematics: Kinematics,
-    /// Where it stands, rad.
+    /// Initial joint positions, rad.
     pub start_joints: Joints,
-    /// Control steps a second.
+    /// Control rate, Hz.
     pub rate_hz: f64,
-    /// Robot mode at the start: running, or switched off.
+    /// Robot mode at the start: running or powered off.
     pub start_mode: RobotMode,
-    /// Controller time at the start, s. Above 40 s Universal Robots' C++ client does not wait for a boot to end.
+    /// Controller time at the start, s. Below 40 s UR's C++ client waits for the controller to finish booting.
     pub start_clock_s: f64,
-    /// How long powering on and releasing the brakes take, each, s.
+    /// Duration of powering on and of releasing the brakes, each, s.
     pub power_time_s: f64,
-    /// Serial number for the dashboard.
+    /// Serial number, as answered by the dashboard.
     pub serial: String,
-    /// Where `load NAME.urp` finds `NAME.script`.
+    /// Directory in which `load NAME.urp` looks for `NAME.script`.
     pub programs: Option<std::path::PathBuf>,
 }
 
 impl Setup {
-    /// The model as delivered, powered and standing in a bent-elbow pose.
+    /// The nominal model, powered, at rest in a bent-elbow pose.
     pub fn new(model: Model) -> Self {
         Setup {
             model,
@@ -57,7 +65,7 @@ impl Setup {
     }
 }
 
-/// Mass and tool at the flange.
+/// Payload at the flange.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Payload {
     /// kg.
@@ -70,7 +78,7 @@ pub struct Payload {
 
 /// The robot and its controller.
 pub struct Robot {
-    /// What it started as.
+    /// Initial configuration.
     pub setup: Setup,
     /// Control step, s.
     pub dt: f64,
@@ -84,17 +92,21 @@ pub struct Robot {
     pub safety: SafetyMode,
     /// Program state.
     pub runtime: RuntimeState,
-    /// Written by RTDE clients.
+    /// Input registers, written by RTDE clients.
     pub inputs: Registers,
-    /// Written by scripts.
+    /// Output registers, written by scripts.
     pub outputs: Registers,
     /// Digital and analog signals.
     pub signals: Signals,
     /// `external_force_torque` input.
     pub external_wrench: [f64; 6],
+    /// A plane that the TCP can touch.
+    pub contact_plane: Option<ContactPlane>,
+    /// Wrench subtracted by `zero_ftsensor`.
+    pub(super) wrench_zero: [f64; 6],
     /// Speed slider, 0 to 1.
     pub slider: f64,
-    /// At the flange.
+    /// Payload at the flange.
     pub payload: Payload,
     /// Tool centre point in the flange frame.
     pub tcp: [f64; 6],
@@ -104,17 +116,17 @@ pub struct Robot {
     pub outbox: Outbox,
     /// Open popup.
     pub popup: Option<Popup>,
-    /// What is true of this step.
+    /// Values of the present step.
     pub truth: Report,
-    /// What RTDE, primary and real-time interfaces tell of it.
+    /// The same values as reported by the RTDE, primary and real-time interfaces, faults included.
     pub report: Report,
-    /// Distortions of the report.
+    /// Faults in the reported values.
     pub report_fault: ReportFault,
-    /// Whether `rtde_set_watchdog` is accepted but never acts (fault R15).
+    /// Fault: `rtde_set_watchdog` is accepted without effect.
     pub deaf_watchdog: bool,
-    /// Whether writes of scripts to output registers are lost (fault R15).
+    /// Fault: what scripts write to output registers is lost.
     pub mute_outputs: bool,
-    /// Robot type answered on the primary interface in place of the true one (fault B17).
+    /// Fault: robot type reported on the primary interface instead of the true one.
     pub claimed_robot_type: Option<i32>,
     pub(super) generator: Generator,
     pub(super) drives: Drives,
@@ -122,15 +134,17 @@ pub struct Robot {
     pub(super) watchdogs: Watchdogs,
     pub(super) motion_left_s: Option<f64>,
     pub(super) motion_failure: Option<String>,
-    pub(super) sockets: super::host::Sockets,
-    pub(super) memory: super::questions::Memory,
-    safety_since_s: f64,
-    transition: Option<(f64, RobotMode)>,
+    pub(super) sockets: Sockets,
+    pub(super) remote_calls: RemoteCalls,
+    pub(super) devices: Devices,
+    pub(super) memory: Memory,
+    pub(super) safety_since_s: f64,
+    pub(super) transition: Option<(f64, RobotMode)>,
     clock_offset_s: f64,
 }
 
 impl Robot {
-    /// A robot as `setup` says.
+    /// A robot with this configuration.
     pub fn new(setup: Setup) -> Self {
         let dt = 1.0 / setup.rate_hz;
         let q = setup.start_joints;
@@ -145,6 +159,8 @@ impl Robot {
             outputs: Registers::default(),
             signals: Signals::default(),
             external_wrench: [0.0; 6],
+            contact_plane: None,
+            wrench_zero: [0.0; 6],
             slider: 1.0,
             payload: Payload { mass: 0.0, cog: [0.0; 3], inertia: [0.0; 6] },
             tcp: [0.0; 6],
@@ -158,25 +174,27 @@ impl Robot {
             mute_outputs: false,
             claimed_robot_type: None,
             generator: Generator::new(q, setup.kinematics, setup.model.max_speed, setup.model.position_limit()),
-            drives: Drives::new(q, DRIVE_ACCEL).limited(setup.model.max_speed),
+            drives: Drives::new(q, MAX_DRIVE_ACCEL).limited(setup.model.max_speed),
             programs: Programs::default(),
             watchdogs: Watchdogs::default(),
             motion_left_s: None,
             motion_failure: None,
-            sockets: super::host::Sockets::default(),
-            memory: super::questions::Memory::default(),
+            sockets: Sockets::default(),
+            remote_calls: RemoteCalls::default(),
+            devices: Devices::default(),
+            memory: Memory::default(),
             safety_since_s: f64::NEG_INFINITY,
             transition: None,
             clock_offset_s: 0.0,
             setup,
         };
         robot.drives.set_brakes(robot.mode != RobotMode::Running);
-        robot.truth = Report::of(&robot);
+        robot.truth = robot.measure();
         robot.report = robot.truth.clone();
         robot
     }
 
-    /// One control step: program, motion, joints, supervision. Returns with `report` renewed.
+    /// Runs one control step: programs, motion, joints, supervision, then the report.
     pub fn step(&mut self) {
         self.steps += 1;
         self.clock_s = self.setup.start_clock_s + self.clock_offset_s + self.steps as f64 * self.dt;
@@ -185,7 +203,7 @@ impl Robot {
         self.run_programs();
         self.move_arm();
         self.settle_runtime();
-        self.truth = Report::of(self);
+        self.truth = self.measure();
         self.memory.note(&self.truth.actual_q, &self.truth.tcp_force);
         self.report = self.truth.distorted(&self.report_fault);
     }
@@ -200,7 +218,7 @@ impl Robot {
         (self.clock_s.max(0.0) * 1e6) as u64
     }
 
-    /// Lets the controller's clock start again from zero, or jump by `by_s` seconds (fault R12).
+    /// Restarts controller time at zero, or shifts it by `by_s` seconds.
     pub fn shift_clock(&mut self, by_s: Option<f64>) {
         self.clock_offset_s = match by_s {
             Some(by) => self.clock_offset_s + by,
@@ -221,6 +239,7 @@ impl Robot {
             let paused = matches!(self.runtime, RuntimeState::Pausing | RuntimeState::Paused);
             let scaling = if paused { 0.0 } else { self.slider };
             self.generator.set_tool(crate::plant::vector_to_pose(&self.tcp));
+            self.generator.set_measured_wrench(self.measured_wrench());
             if let Err(cause) = self.generator.step(self.dt, scaling) {
                 self.stop_for(cause);
             }
@@ -234,7 +253,7 @@ impl Robot {
             let worst = (0..6)
                 .map(|i| (i, (q[i] - self.generator.q()[i]).abs()))
                 .fold((0, 0.0), |m, d| if d.1 > m.1 { d } else { m });
-            if worst.1 > PATH_TOLERANCE {
+            if worst.1 > MAX_PATH_DEVIATION_RAD {
                 self.stop_for(StopCause::PathDeviation { joint: worst.0, deviation: worst.1 });
             }
         }
@@ -242,7 +261,7 @@ impl Robot {
 
     fn stop_for(&mut self, cause: StopCause) {
         if cause == StopCause::Unreachable {
-            // The script's own mistake: its call fails, and the program with it.
+            // An error of the script: its call fails, and the program ends.
             self.motion_failure = Some(cause.to_string());
             return;
         }
@@ -256,156 +275,51 @@ impl Robot {
         self.stop_protectively(code, argument);
     }
 
-    /// Stops the arm as the safety system does; unlocking is refused for five seconds. The program is stopped.
-    pub fn stop_protectively(&mut self, code: i32, argument: i32) {
-        if self.safety.allows_motion() {
-            self.enter_safety(SafetyMode::ProtectiveStop, code, argument);
-            self.end_program();
-            self.generator.safety_stop();
-        }
-    }
-
-    /// Stops the arm with power kept and the program paused, until [`Robot::clear_safety`].
-    pub fn safeguard_stop(&mut self) {
-        if self.safety.allows_motion() {
-            self.enter_safety(SafetyMode::SafeguardStop, 0, 0);
-            if self.runtime == RuntimeState::Playing {
-                self.runtime = RuntimeState::Pausing;
-            }
-        }
-    }
-
-    /// Stops the arm, then takes the power away. `system` tells the emergency input from the pendant's button.
-    pub fn emergency_stop(&mut self, system: bool) {
-        let mode = if system { SafetyMode::SystemEmergencyStop } else { SafetyMode::RobotEmergencyStop };
-        self.enter_safety(mode, 0, 0);
-        self.end_program();
-        self.generator.safety_stop();
-        // Category 1: half a second of controlled stop, then no power.
-        self.transition = Some((self.clock_s + 0.5, RobotMode::PowerOff));
-    }
-
-    /// Brakes at once and takes the power away (category 0): a safety violation, or a fault of the safety system.
-    pub fn safety_failure(&mut self, fault: bool) {
-        self.enter_safety(if fault { SafetyMode::Fault } else { SafetyMode::Violation }, 0, 0);
-        self.end_program();
-        self.set_mode(RobotMode::PowerOff);
-    }
-
-    /// Sets or lifts reduced mode; no effect while stopped.
-    pub fn set_reduced(&mut self, on: bool) {
-        if self.safety.allows_motion() {
-            self.enter_safety(if on { SafetyMode::Reduced } else { SafetyMode::Normal }, 0, 0);
-        }
-        self.generator.set_reduced(on);
-    }
-
-    /// The emergency button is released, the safeguard closed. A protective stop or a fault is not cleared by this.
-    pub fn clear_safety(&mut self) {
-        if self.safety.is_emergency() || matches!(self.safety, SafetyMode::SafeguardStop | SafetyMode::Recovery) {
-            self.enter_safety(SafetyMode::Normal, 0, 0);
-        }
-    }
-
-    /// Unlocks a protective stop; refused in the first five seconds and when there is none.
-    pub fn unlock(&mut self) -> Result<(), &'static str> {
-        if self.safety != SafetyMode::ProtectiveStop {
-            return Ok(());
-        }
-        if self.clock_s - self.safety_since_s < 5.0 {
-            return Err(
-                "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop before unlocking",
-            );
-        }
-        self.enter_safety(SafetyMode::Normal, 0, 0);
-        Ok(())
-    }
-
-    /// Restarts the safety system after a fault or a violation; leaves the arm without power.
-    pub fn restart_safety(&mut self) {
-        self.end_program();
-        self.set_mode(RobotMode::PowerOff);
-        if !self.safety.is_emergency() {
-            self.enter_safety(SafetyMode::Normal, 0, 0);
-        }
-    }
-
-    fn enter_safety(&mut self, mode: SafetyMode, code: i32, argument: i32) {
-        if self.safety != mode {
-            self.safety = mode;
-            self.safety_since_s = self.clock_s;
-            self.say(MessageKind::Safety { code, argument, mode: mode as u8 });
-        }
-    }
-
-    /// Starts to power on; the arm ends with brakes on.
-    pub fn power_on(&mut self) -> bool {
-        if self.mode == RobotMode::PowerOff && !self.safety.is_emergency() && !self.safety_failed() {
-            self.set_mode(RobotMode::PowerOn);
-            self.transition = Some((self.clock_s + self.setup.power_time_s, RobotMode::Idle));
-        }
-        self.mode.is_powered()
-    }
-
-    /// Takes the power away.
-    pub fn power_off(&mut self) {
-        self.end_program();
-        self.set_mode(RobotMode::PowerOff);
-    }
-
-    /// Releases the brakes, powering on first where needed.
-    pub fn brake_release(&mut self) -> bool {
-        if self.safety.is_emergency() || self.safety_failed() {
-            return false;
-        }
-        if self.mode == RobotMode::PowerOff {
-            self.set_mode(RobotMode::PowerOn);
-        }
-        if matches!(self.mode, RobotMode::PowerOn | RobotMode::Idle) {
-            self.transition = Some((self.clock_s + self.setup.power_time_s, RobotMode::Running));
-        }
-        true
-    }
-
-    /// Sets the robot mode at once, as a fault does. Anything but running ends the program and sets the brakes.
-    pub fn set_mode(&mut self, mode: RobotMode) {
-        self.transition = None;
-        self.mode = mode;
-        self.drives.set_brakes(mode != RobotMode::Running);
-        if mode != RobotMode::Running {
-            self.end_program();
-        }
-    }
-
-    fn safety_failed(&self) -> bool {
-        matches!(self.safety, SafetyMode::Violation | SafetyMode::Fault)
-    }
-
-    fn advance_mode(&mut self) {
-        if let Some((at, mode)) = self.transition
-            && self.clock_s >= at
-        {
-            self.set_mode(mode);
-        }
-    }
-
-    /// Puts the arm at `q`, at rest (faults B07 and B11, and the start of a test).
+    /// Places the arm at `q`, at rest.
     pub fn teleport(&mut self, q: Joints) {
         let fault = *self.drives.fault();
-        self.drives = Drives::new(q, DRIVE_ACCEL).limited(self.setup.model.max_speed);
+        self.drives = Drives::new(q, MAX_DRIVE_ACCEL).limited(self.setup.model.max_speed);
         self.drives.set_fault(fault);
         self.drives.set_brakes(self.mode != RobotMode::Running);
         self.generator.snap(q);
     }
 
-    /// Puts a disturbance on the joints.
+    /// Changes the disturbance of the joints.
     pub fn set_drive_fault(&mut self, change: impl FnOnce(&mut crate::plant::DriveFault)) {
         let mut fault = *self.drives.fault();
         change(&mut fault);
         self.drives.set_fault(fault);
     }
 
-    /// Whether targets and joints stand still.
+    /// Changes the disturbance of one joint.
+    ///
+    /// # Errors
+    /// There is no such joint.
+    pub(super) fn set_joint_fault(
+        &mut self,
+        joint: usize,
+        change: impl FnOnce(&mut crate::plant::DriveFault),
+    ) -> Result<(), &'static str> {
+        if joint > 5 {
+            return Err(JOINT_NUMBERS);
+        }
+        self.set_drive_fault(change);
+        Ok(())
+    }
+
+    /// Sets the speed slider.
+    ///
+    /// # Errors
+    /// The fraction is outside 0 to 1.
+    pub(super) fn set_slider(&mut self, fraction: f64) -> Result<(), String> {
+        if !(0.0..=1.0).contains(&fraction) {
+            return Err(format!("speed slider {fraction} is outside 0 to 1"));
+        }
+        self.slider = fraction;
+        Ok(())
+    }
+
+    /// Whether targets and joints are at rest.
     pub fn at_rest(&self) -> bool {
         self.generator.at_rest() && self.drives.read_qd().iter().all(|v| v.abs() < 1e-3)
     }

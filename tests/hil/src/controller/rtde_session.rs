@@ -1,14 +1,14 @@
-//! The controller's side of one RTDE connection, without a socket: bytes in, answers and effects out.
+//! The controller's side of one RTDE connection, without a socket: bytes in, answers and effects on the robot out.
 
 use super::link_faults::RtdeFaults;
 use super::robot::Robot;
 use super::variables::Output;
 use graspd_rt::rtde::{Field, FrameError, Framer, INPUT_COUNT, MAX_PACKAGE, Side, Value};
 
-/// Number of a connection, never used twice.
+/// Number of a connection; never reused.
 pub type ClientId = u64;
 
-/// Which connection holds which input.
+/// Which connection owns which RTDE input.
 #[derive(Clone, Debug)]
 pub struct Ownership([Option<ClientId>; INPUT_COUNT]);
 
@@ -19,7 +19,7 @@ impl Default for Ownership {
 }
 
 impl Ownership {
-    /// Ends what a connection held.
+    /// Releases all inputs of a connection.
     pub fn release(&mut self, client: ClientId) {
         for owner in &mut self.0 {
             if *owner == Some(client) {
@@ -39,7 +39,7 @@ impl Ownership {
     }
 }
 
-/// Types of package, both directions.
+/// Package types, both directions.
 mod kind {
     pub(super) const REQUEST_VERSION: u8 = 86;
     pub(super) const CONTROL_VERSION: u8 = 118;
@@ -51,8 +51,8 @@ mod kind {
     pub(super) const PAUSE: u8 = 80;
 }
 
-/// Input recipes of one connection, at most.
-const MOST_RECIPES: usize = 255;
+/// Input recipes of one connection; a recipe id is one byte and 0 means none.
+const MAX_RECIPES: usize = 255;
 
 /// One RTDE connection.
 pub struct RtdeSession {
@@ -64,29 +64,29 @@ pub struct RtdeSession {
     output_setups: u8,
     inputs: Vec<Vec<Field>>,
     started: bool,
-    /// Packages of data received.
+    /// Data packages received.
     pub received: u64,
 }
 
 struct OutputRecipe {
     id: u8,
     fields: Vec<Output>,
-    /// Control steps between packages, may be fractional.
+    /// Control steps between packages; may be fractional.
     period: f64,
     /// Steps until the next package.
     left: f64,
 }
 
-/// One input package as it took effect.
+/// One input package, as applied to the robot.
 pub struct InputPackage {
-    /// Who wrote it.
+    /// Connection that sent it.
     pub client: ClientId,
     /// Its fields in recipe order.
     pub values: Vec<(Field, Value)>,
 }
 
 impl RtdeSession {
-    /// A fresh connection, in protocol version 1.
+    /// A new connection, in protocol version 1.
     pub fn new(client: ClientId) -> Self {
         RtdeSession {
             client,
@@ -100,10 +100,11 @@ impl RtdeSession {
         }
     }
 
-    /// Takes bytes as they came, in any cut. Answers go to `out`; input packages are applied to the robot and told to `note`.
+    /// Takes received bytes, however they are split. Appends answers to `out`; applies input packages to the robot and
+    /// passes them to `note`.
     ///
     /// # Errors
-    /// When framing is lost: the connection must be closed.
+    /// Framing is lost: the connection must be closed.
     pub fn receive(
         &mut self,
         mut bytes: &[u8],
@@ -116,7 +117,7 @@ impl RtdeSession {
         while !bytes.is_empty() {
             let taken = self.framer.feed(bytes);
             bytes = bytes.get(taken..).unwrap_or_default();
-            // Copied out, because an answer needs the whole session; a package is at most 64 KiB.
+            // Copied, because an answer borrows the whole session; a package is at most 64 KiB.
             while let Some((kind, body)) = self.framer.next()?.map(|p| (p.kind, p.body.to_vec())) {
                 self.package(kind, &body, robot, owners, faults, out, note);
             }
@@ -124,7 +125,7 @@ impl RtdeSession {
         Ok(())
     }
 
-    #[expect(clippy::too_many_arguments, reason = "the parts of the world that one package may touch")]
+    #[expect(clippy::too_many_arguments, reason = "the parts of the world that one package may change")]
     fn package(
         &mut self,
         kind: u8,
@@ -167,7 +168,7 @@ impl RtdeSession {
         }
     }
 
-    /// A text message to the client.
+    /// Sends a text message to the client.
     fn complain(&self, out: &mut Vec<u8>, text: &str) {
         const WARNING: u8 = 2;
         let mut body = Vec::with_capacity(text.len() + 16);
@@ -191,7 +192,7 @@ impl RtdeSession {
             _ if self.version == 2 => (top, &[][..]),
             _ => (top, body),
         };
-        // No document says what happens outside (0, maximum]; the maximum is the mildest answer.
+        // The documents do not define frequencies outside (0, maximum]; the maximum is the most tolerant choice.
         let frequency = if frequency > 0.0 && frequency <= top { frequency } else { top };
         let mut words = Vec::new();
         let mut fields = Vec::new();
@@ -199,19 +200,19 @@ impl RtdeSession {
             match Field::find(Side::Output, &name).filter(|_| !faults.not_found.contains(&name)) {
                 Some(field) => {
                     fields.push(Output::new(field));
-                    words.push(faults.type_word(&name, field.kind().name()));
+                    words.push(faults.type_name(&name, field.kind().name()));
                 }
                 None => words.push("NOT_FOUND"),
             }
         }
-        let whole = fields.len() == words.len() && !fields.is_empty();
-        let id = if whole {
+        let complete = fields.len() == words.len() && !fields.is_empty();
+        let id = if complete {
             self.output_setups = self.output_setups.checked_add(1).unwrap_or(1);
             self.output_setups
         } else {
             0
         };
-        self.outputs = whole.then(|| OutputRecipe { id, fields, period: top / frequency, left: 1.0 });
+        self.outputs = complete.then(|| OutputRecipe { id, fields, period: top / frequency, left: 1.0 });
         let types = words.join(",");
         let mut answer = Vec::with_capacity(types.len() + 1);
         if self.version == 2 {
@@ -230,14 +231,14 @@ impl RtdeSession {
                 Some(f) if faults.in_use.contains(&name) || !owners.is_free(f, self.client) => words.push("IN_USE"),
                 Some(field) => {
                     fields.push(field);
-                    words.push(faults.type_word(&name, field.kind().name()));
+                    words.push(faults.type_name(&name, field.kind().name()));
                 }
             }
         }
-        // A recipe that is not whole gets no id and holds none of its inputs.
-        let whole = fields.len() == words.len() && !fields.is_empty() && self.inputs.len() < MOST_RECIPES;
+        // An incomplete recipe gets no id and owns none of its inputs.
+        let complete = fields.len() == words.len() && !fields.is_empty() && self.inputs.len() < MAX_RECIPES;
         let mut id = 0;
-        if whole {
+        if complete {
             for &field in &fields {
                 owners.claim(field, self.client);
             }
@@ -249,7 +250,7 @@ impl RtdeSession {
         put(out, kind::SETUP_INPUTS, &answer);
     }
 
-    /// Values of an input package; `None` when the recipe is unknown or the length is wrong.
+    /// Values of an input package; `None` if the recipe is unknown or the length does not match it.
     fn decode(&self, body: &[u8]) -> Option<Vec<(Field, Value)>> {
         let (&id, mut rest) = body.split_first()?;
         let recipe = self.inputs.get(usize::from(id).checked_sub(1)?)?;
@@ -261,7 +262,7 @@ impl RtdeSession {
         rest.is_empty().then_some(values)
     }
 
-    /// One control step passed: appends a data package to `out` when one is due; true if so.
+    /// Counts one control step. Appends a data package to `out` and returns true if one is due.
     pub fn sample(&mut self, robot: &Robot, out: &mut Vec<u8>) -> bool {
         let version = self.version;
         let Some(recipe) = self.outputs.as_mut().filter(|_| self.started) else { return false };
@@ -285,7 +286,7 @@ impl RtdeSession {
     }
 }
 
-/// Names of a recipe; a trailing comma adds none.
+/// Names of a recipe; SDU's client ends its list with a comma, which adds no name.
 fn split_names(bytes: &[u8]) -> Vec<String> {
     bytes
         .split(|b| *b == b',')
@@ -302,7 +303,7 @@ pub(super) fn put(out: &mut Vec<u8>, kind: u8, body: &[u8]) {
     seal(out, start);
 }
 
-/// Writes the size of the package that begins at `start`; a package that no size can state is taken back.
+/// Fills in the size of the package that begins at `start`; removes a package that is too long for the size field.
 fn seal(out: &mut Vec<u8>, start: usize) {
     match u16::try_from(out.len() - start) {
         Ok(size) => {

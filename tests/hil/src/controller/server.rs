@@ -1,10 +1,10 @@
-//! The sockets: one thread that polls them all and keeps the control step's grid.
+//! The servers: one thread polls all sockets and runs the control steps on a fixed time grid.
 //!
-//! One thread, so that nothing has to be locked and a thousand reconnects start no thread. Between two steps it sleeps in
-//! `poll`, with the step's absolute deadline as the limit.
+//! A single thread needs no locks, and reconnecting clients start no threads. Between two steps it sleeps in `poll`, at
+//! most until the deadline of the next step.
 
 use super::command::{Command, Port, WireAction};
-use super::connection::{Connection, READ, Role, lines};
+use super::connection::{Connection, READ_BYTES, Role, lines};
 use super::rtde_session::RtdeSession;
 use super::world::World;
 use super::{dashboard, primary};
@@ -15,12 +15,18 @@ use std::net::{IpAddr, SocketAddr, TcpListener};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Connections at a time; more are closed at once.
-const MOST_CONNECTIONS: usize = 128;
-/// Steps made up after the host stalled; beyond that the grid moves.
-const MOST_CATCH_UP: u32 = 50;
-/// Longest line of a text port, bytes; a script may come through the control port.
-const LONGEST_LINE: usize = 1 << 20;
+/// Simultaneous connections; further ones are closed immediately.
+const MAX_CONNECTIONS: usize = 128;
+/// Control steps run in one go after the host stalled; beyond them the time grid is shifted.
+const MAX_CATCH_UP_STEPS: u32 = 50;
+/// Pause between two reads after which the line numbers of a client's text begin again, ns.
+const SEND_GAP_NS: u64 = 100_000_000;
+/// Longest line of the control and the interpreter port; it may hold a script.
+const MAX_CONTROL_LINE_BYTES: usize = 1 << 20;
+/// Longest line of the dashboard.
+const MAX_DASHBOARD_LINE_BYTES: usize = 4096;
+/// Connections accepted from one listener between two polls, so that the control step is not delayed.
+const MAX_ACCEPTS: usize = 16;
 
 /// Nanoseconds of CLOCK_MONOTONIC.
 pub fn now_ns() -> u64 {
@@ -36,7 +42,7 @@ struct Listener {
 
 /// The servers of one controller.
 pub struct Server {
-    /// What is behind them.
+    /// The robot, the judge and the faults.
     pub world: World,
     listeners: Vec<Listener>,
     connections: Vec<Connection>,
@@ -46,7 +52,7 @@ pub struct Server {
     pub late_steps: u64,
 }
 
-/// A port that cannot be opened.
+/// A port could not be opened.
 #[derive(Debug, thiserror::Error)]
 #[error(
     "cannot listen on {address}: {error}; is another controller running there? Try --port-offset or another --bind address"
@@ -56,8 +62,8 @@ pub struct ListenError {
     error: std::io::Error,
 }
 
-/// Ports of a controller, with the read-only twins.
-const PORTS: [(u16, Port, bool); 8] = [
+/// Ports of a controller; the last field is true for the read-only ones.
+const PORTS: [(u16, Port, bool); 9] = [
     (29999, Port::Dashboard, false),
     (30001, Port::Primary, false),
     (30002, Port::Secondary, false),
@@ -66,14 +72,15 @@ const PORTS: [(u16, Port, bool); 8] = [
     (30011, Port::Primary, true),
     (30012, Port::Secondary, true),
     (30013, Port::Realtime, true),
+    (30020, Port::Interpreter, false),
 ];
 
 impl Server {
-    /// Opens all ports at `address`, each moved by `offset`, and the control port where one is given (0 picks a free one).
+    /// Opens all ports at `address`, `offset` added to each, and the control port if one is given (0 picks a free port).
     pub fn bind(world: World, address: IpAddr, offset: u16, control: Option<u16>) -> Result<Self, ListenError> {
         let mut listeners = Vec::new();
-        let wanted = PORTS.iter().map(|(number, port, ro)| (number.saturating_add(offset), *port, *ro));
-        for (number, port, read_only) in wanted.chain(control.map(|c| (c, Port::Control, false))) {
+        let standard = PORTS.iter().map(|(number, port, ro)| (number.saturating_add(offset), *port, *ro));
+        for (number, port, read_only) in standard.chain(control.map(|c| (c, Port::Control, false))) {
             let address = SocketAddr::new(address, number);
             let socket = TcpListener::bind(address)
                 .and_then(|s| s.set_nonblocking(true).map(|()| s))
@@ -84,7 +91,7 @@ impl Server {
         Ok(Server { world, listeners, connections: Vec::new(), next_id: 1, period_ns, late_steps: 0 })
     }
 
-    /// The number of the control port, when there is one.
+    /// The number of the control port, if there is one.
     pub fn control_port(&self) -> Option<u16> {
         let control = self.listeners.iter().find(|l| l.port == Port::Control)?;
         control.socket.local_addr().ok().map(|a| a.port())
@@ -93,7 +100,7 @@ impl Server {
     /// Serves until `stop` is set.
     pub fn run(&mut self, stop: &Arc<AtomicBool>) {
         let mut deadline = now_ns() + self.period_ns;
-        let mut buffer = vec![0; READ];
+        let mut buffer = vec![0; READ_BYTES];
         while !stop.load(Ordering::Relaxed) {
             let now = now_ns();
             if now >= deadline {
@@ -106,23 +113,23 @@ impl Server {
         self.world.note(now_ns(), "stopped");
     }
 
-    /// Deals with everything that clients have sent, without waiting. With [`Server::step`] in place of [`Server::run`] the caller
-    /// keeps the time: real sockets and real bytes on a virtual clock.
+    /// Handles everything that clients have sent, without waiting. Together with [`Server::step`] it replaces
+    /// [`Server::run`] where the caller keeps the time: real sockets on a virtual clock.
     pub fn serve(&mut self, now: u64) {
-        let mut buffer = vec![0; READ];
+        let mut buffer = vec![0; READ_BYTES];
         self.wait(0, &mut buffer, || now);
         self.act(now);
-        self.bury(now);
+        self.remove_ended(now);
     }
 
-    /// One control step at `now`, and what it sends to everybody.
+    /// Runs one control step at `now` and sends its packages.
     pub fn step(&mut self, now: u64) {
         self.world.step(now);
         self.send_step(now);
     }
 
-    /// Runs the steps that are due and returns the next deadline. After a stall the robot makes up its steps, and clients get
-    /// the newest package only.
+    /// Runs the steps that are due and returns the next deadline. After a stall the missed steps are run in one go, and
+    /// clients get the newest package only.
     fn steps_due(&mut self, now: u64, mut deadline: u64) -> u64 {
         if now - deadline > self.period_ns {
             self.late_steps += 1;
@@ -132,7 +139,7 @@ impl Server {
             self.world.step(now);
             deadline += self.period_ns;
             made_up += 1;
-            if made_up == MOST_CATCH_UP && deadline <= now {
+            if made_up == MAX_CATCH_UP_STEPS && deadline <= now {
                 deadline = now + self.period_ns;
             }
         }
@@ -140,7 +147,7 @@ impl Server {
         deadline
     }
 
-    /// What one step sends to everybody.
+    /// Sends the packages of one control step to all connections.
     fn send_step(&mut self, now: u64) {
         let every = (self.world.robot.setup.rate_hz / 10.0).max(1.0) as u64;
         let steps = self.world.robot.steps;
@@ -179,14 +186,14 @@ impl Server {
                         }
                     }
                 }
-                Role::Dashboard(_) | Role::Control(_) => {}
+                Role::Dashboard(_) | Role::Interpreter(_) | Role::Control(_) => {}
             }
             c.flush(&wire, now);
         }
-        self.bury(now);
+        self.remove_ended(now);
     }
 
-    /// Sleeps until something happens, at most `for_ns`, and deals with it.
+    /// Sleeps until a socket is ready, at most `for_ns`, and handles it.
     fn wait(&mut self, for_ns: u64, buffer: &mut [u8], clock: impl Fn() -> u64) {
         let now = clock();
         let mut polls = Vec::with_capacity(self.listeners.len() + self.connections.len());
@@ -202,7 +209,7 @@ impl Server {
             polls.push(PollFd::new(&c.stream, flags));
         }
         let timeout = Timespec { tv_sec: (for_ns / 1_000_000_000) as i64, tv_nsec: (for_ns % 1_000_000_000) as i64 };
-        // A signal ends the wait early; the caller looks at its flag.
+        // A signal ends the wait early; the caller then checks its flag.
         if poll(&mut polls, Some(&timeout)).unwrap_or(0) == 0 && self.connections.iter().all(|c| c.next_due().is_none())
         {
             return;
@@ -227,17 +234,16 @@ impl Server {
             }
         }
         self.act(now);
-        self.bury(now);
+        self.remove_ended(now);
     }
 
     fn accept(&mut self, listener: usize, now: u64) {
         let Some(l) = self.listeners.get(listener) else { return };
-        // A handful at a time: the control step comes first.
-        for _ in 0..16 {
+        for _ in 0..MAX_ACCEPTS {
             let Ok((stream, peer)) = l.socket.accept() else { break };
             let (port, read_only) = (l.port, l.read_only);
-            if self.world.wire(port).refuse || self.connections.len() >= MOST_CONNECTIONS {
-                continue; // dropped, and thereby closed
+            if self.world.wire(port).refuse || self.connections.len() >= MAX_CONNECTIONS {
+                continue; // dropping the stream closes it
             }
             let id = self.next_id;
             self.next_id += 1;
@@ -247,6 +253,7 @@ impl Server {
                 Port::Primary | Port::Secondary => Role::State { scripts: scripts() },
                 Port::Realtime => Role::Realtime { scripts: scripts() },
                 Port::Rtde => Role::Rtde(Box::new(RtdeSession::new(id))),
+                Port::Interpreter => Role::Interpreter(Vec::new()),
                 Port::Control => Role::Control(Vec::new()),
             };
             let Ok(mut c) = Connection::new(id, port, role, stream) else { continue };
@@ -259,14 +266,14 @@ impl Server {
                     c.send(&primary::robot_state(&self.world.robot, true), &wire, now, random);
                 }
                 Port::Rtde => self.world.judge.forget_client(),
-                Port::Realtime | Port::Control => {}
+                Port::Realtime | Port::Interpreter | Port::Control => {}
             }
             self.world.note(now, &format!("connection {id} {port:?} from {peer}"));
             self.connections.push(c);
         }
     }
 
-    /// What the control port asked to be done with connections.
+    /// Carries out the connection actions of the control port.
     fn act(&mut self, now: u64) {
         for action in std::mem::take(&mut self.world.actions) {
             for c in &mut self.connections {
@@ -283,8 +290,8 @@ impl Server {
         }
     }
 
-    /// Takes away connections that are over, with what they held.
-    fn bury(&mut self, now: u64) {
+    /// Removes ended connections and releases their RTDE inputs.
+    fn remove_ended(&mut self, now: u64) {
         let mut i = 0;
         while let Some(c) = self.connections.get(i) {
             let Some(reason) = c.over else {
@@ -292,19 +299,34 @@ impl Server {
                 continue;
             };
             self.world.owners.release(c.id);
-            let text = format!("connection {} {:?} over: {reason}; {} packages left out", c.id, c.port, c.skipped);
+            let text = format!("connection {} {:?} ended: {reason}; {} packages skipped", c.id, c.port, c.skipped);
             self.world.note(now, &text);
             self.connections.swap_remove(i);
         }
     }
 }
 
-/// A line for whoever started the program; where nobody listens it is lost.
-fn tell(text: &str) {
+/// Prints a line to standard error; ignores a closed one.
+fn log(text: &str) {
     let _ = std::io::Write::write_fmt(&mut std::io::stderr(), format_args!("graspd-mock-ur: {text}\n"));
 }
 
-/// Reads what came on a connection and deals with it.
+/// Starts an uploaded program, or stops the running one.
+fn run_upload(upload: Upload, world: &mut World, now: u64) {
+    match upload {
+        Upload::Program { text, first_line } => {
+            if let super::programs::Upload::Refused(reason) = world.upload(now, &text, first_line) {
+                log(&format!("script refused: {reason}"));
+            }
+        }
+        Upload::StopProgram => {
+            world.note(now, "stop program");
+            world.robot.stop_program();
+        }
+    }
+}
+
+/// Reads from a connection and handles what was read.
 fn receive(c: &mut Connection, world: &mut World, buffer: &mut [u8], now: u64) {
     let Some(bytes) = c.read(buffer).map(<[u8]>::to_vec) else { return };
     let wire = world.wire(c.port);
@@ -313,7 +335,7 @@ fn receive(c: &mut Connection, world: &mut World, buffer: &mut [u8], now: u64) {
     }
     let mut answer = Vec::new();
     match &mut c.role {
-        Role::Dashboard(rest) => match lines(rest, &bytes, 4096) {
+        Role::Dashboard(rest) => match lines(rest, &bytes, MAX_DASHBOARD_LINE_BYTES) {
             Ok(found) => {
                 for line in found {
                     let reply = dashboard::answer(&mut world.robot, &line);
@@ -323,9 +345,18 @@ fn receive(c: &mut Connection, world: &mut World, buffer: &mut [u8], now: u64) {
                     c.finishing |= reply.close;
                 }
             }
-            Err(()) => c.over = Some("sent a line without an end"),
+            Err(()) => c.over = Some("sent an overlong line"),
         },
-        Role::Control(rest) => match lines(rest, &bytes, LONGEST_LINE) {
+        Role::Interpreter(rest) => match lines(rest, &bytes, MAX_CONTROL_LINE_BYTES) {
+            Ok(found) => {
+                for line in found.iter().filter(|l| !l.trim().is_empty()) {
+                    answer.extend_from_slice(world.robot.interpret(line).replace(['\n', '\r'], " ").as_bytes());
+                    answer.push(b'\n');
+                }
+            }
+            Err(()) => c.over = Some("sent an overlong line"),
+        },
+        Role::Control(rest) => match lines(rest, &bytes, MAX_CONTROL_LINE_BYTES) {
             Ok(found) => {
                 for line in found {
                     let result = serde_json::from_str::<Command>(&line)
@@ -339,27 +370,19 @@ fn receive(c: &mut Connection, world: &mut World, buffer: &mut [u8], now: u64) {
                     answer.push(b'\n');
                 }
             }
-            Err(()) => c.over = Some("sent a line without an end"),
+            Err(()) => c.over = Some("sent an overlong line"),
         },
-        Role::State { scripts: Some(stream) } | Role::Realtime { scripts: Some(stream) } => match stream.push(&bytes) {
-            Ok(uploads) => {
-                for upload in uploads {
-                    match upload {
-                        Upload::Program(text) => {
-                            if let super::program::Upload::Refused(reason) = world.upload(now, &text) {
-                                tell(&format!("script refused: {reason}"));
-                            }
-                        }
-                        Upload::StopProgram => {
-                            world.note(now, "stop program");
-                            world.robot.stop_program();
-                        }
-                    }
-                }
+        Role::State { scripts: Some(stream) } | Role::Realtime { scripts: Some(stream) } => {
+            if now.saturating_sub(c.read_ns) > SEND_GAP_NS {
+                stream.begin_send();
             }
-            Err(reason) => c.over = Some(reason),
-        },
-        // The read-only ports hear nothing.
+            c.read_ns = now;
+            match stream.push(&bytes) {
+                Ok(uploads) => uploads.into_iter().for_each(|upload| run_upload(upload, world, now)),
+                Err(reason) => c.over = Some(reason),
+            }
+        }
+        // Read-only ports ignore input.
         Role::State { scripts: None } | Role::Realtime { scripts: None } => {}
         Role::Rtde(session) => {
             let World { robot, owners, rtde_faults, judge, recorder, .. } = world;

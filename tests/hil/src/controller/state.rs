@@ -1,31 +1,31 @@
-//! The words a controller uses about itself: robot mode, safety mode, runtime state, and the bits made of them.
+//! Robot mode, safety mode and runtime state, with their names and status bits.
 
 /// `robot_mode`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RobotMode {
-    /// No connection between the halves of the controller.
+    /// No connection to the arm.
     Disconnected = 0,
-    /// A new safety configuration waits to be confirmed.
+    /// A new safety configuration must be confirmed.
     ConfirmSafety = 1,
     /// Starting up.
     Booting = 2,
-    /// Motors without power.
+    /// Motors off.
     PowerOff = 3,
-    /// Motors get power.
+    /// Motors being powered.
     PowerOn = 4,
     /// Powered, brakes on.
     Idle = 5,
-    /// Moved by hand without gravity compensation.
+    /// Moved by hand with brakes released and motors off.
     Backdrive = 6,
     /// Brakes open, ready to move.
     Running = 7,
-    /// Firmware is written.
+    /// Firmware update.
     UpdatingFirmware = 8,
 }
 
 impl RobotMode {
-    /// As the dashboard writes it.
+    /// Name on the dashboard.
     pub fn name(self) -> &'static str {
         match self {
             RobotMode::Disconnected => "DISCONNECTED",
@@ -40,7 +40,7 @@ impl RobotMode {
         }
     }
 
-    /// Whether the motors have power.
+    /// Whether the motors are powered.
     pub fn is_powered(self) -> bool {
         matches!(self, RobotMode::PowerOn | RobotMode::Idle | RobotMode::Backdrive | RobotMode::Running)
     }
@@ -61,13 +61,13 @@ impl RobotMode {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum SafetyMode {
-    /// Nothing stops the arm.
+    /// Normal operation.
     Normal = 1,
-    /// Lower limits.
+    /// Reduced limits.
     Reduced = 2,
-    /// Stopped by the controller; unlocked after five seconds at the earliest.
+    /// Stopped by the controller; can be unlocked after 5 s.
     ProtectiveStop = 3,
-    /// Outside its limits, may only be moved back.
+    /// Outside its limits; may only be moved back.
     Recovery = 4,
     /// Stopped by the safeguard input.
     SafeguardStop = 5,
@@ -82,7 +82,7 @@ pub enum SafetyMode {
 }
 
 impl SafetyMode {
-    /// As the dashboard writes it.
+    /// Name on the dashboard.
     pub fn name(self) -> &'static str {
         match self {
             SafetyMode::Normal => "NORMAL",
@@ -128,22 +128,22 @@ impl SafetyMode {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RuntimeState {
-    /// On the way to stopped.
+    /// Decelerating to stopped.
     Stopping = 0,
-    /// No program runs.
+    /// No program is running.
     Stopped = 1,
-    /// A program runs.
+    /// A program is running.
     Playing = 2,
-    /// On the way to paused.
+    /// Decelerating to paused.
     Pausing = 3,
-    /// A program waits to go on.
+    /// A program is paused.
     Paused = 4,
-    /// On the way back to playing.
+    /// Accelerating back to playing.
     Resuming = 5,
 }
 
 impl RuntimeState {
-    /// As the dashboard writes it.
+    /// Name on the dashboard.
     pub fn name(self) -> &'static str {
         match self {
             RuntimeState::Playing | RuntimeState::Resuming | RuntimeState::Stopping => "PLAYING",

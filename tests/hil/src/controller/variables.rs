@@ -1,9 +1,9 @@
-//! RTDE variables of the robot: what each output says, and what each input does.
+//! RTDE variables of the robot: the value of each output and the effect of each input.
 
 use super::robot::Robot;
 use graspd_rt::rtde::{Field, FieldType, Value};
 
-/// Where an output's value comes from; resolved once, when a recipe is set up.
+/// Type and getter of an output; resolved once, when a recipe is set up.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Source {
     field: FieldType,
@@ -12,7 +12,7 @@ pub(super) struct Source {
 
 type Getter = fn(&Robot, usize) -> Value;
 
-/// One output of a recipe: its source and the number of its register.
+/// One output of a recipe: its source and its register number.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Output {
     source: Source,
@@ -20,13 +20,13 @@ pub(super) struct Output {
 }
 
 impl Output {
-    /// Finds the source of `field`.
+    /// Looks up the source of `field`.
     pub(super) fn new(field: Field) -> Output {
         let (stem, number) = field.stem();
         Output { source: Source { field: field.kind(), get: getter(stem) }, number: number.map_or(0, usize::from) }
     }
 
-    /// The value now; the zero of the field's type for what this robot does not have.
+    /// The present value; zero of the field's type for an output that this robot does not have.
     pub(super) fn value(&self, robot: &Robot) -> Value {
         let value = (self.source.get)(robot, self.number);
         if value.kind() == self.source.field { value } else { self.source.field.zero() }
@@ -118,12 +118,12 @@ fn getter(stem: &'static str) -> Getter {
         "input_int_register_" => |r, n| Int32(r.inputs.ints.get(n).copied().unwrap_or(0)),
         "output_double_register_" => |r, n| Double(r.outputs.doubles.get(n).copied().unwrap_or(0.0)),
         "input_double_register_" => |r, n| Double(r.inputs.doubles.get(n).copied().unwrap_or(0.0)),
-        // Euromap, encoders, inverse dynamics: this box has none of them; the zero of the type stands for "not there".
+        // Euromap, encoders, inverse dynamics: not simulated. The type mismatch makes `value` return zero.
         _ => |_, _| Bool(false),
     }
 }
 
-/// Fields of one input package that only mean something together: a mask and what it masks.
+/// Fields of one input package that belong together: masks and the values they select.
 #[derive(Default)]
 struct Masked {
     standard: (u8, u8),
@@ -137,12 +137,12 @@ struct Masked {
 }
 
 impl Robot {
-    /// Bits of `robot_status_bits`.
+    /// `robot_status_bits`.
     pub fn status_bits(&self) -> u32 {
         u32::from(self.mode.is_powered()) | u32::from(self.is_program_running()) << 1
     }
 
-    /// Applies one input package. Values that are not finite are kept as they came: a register holds what a client wrote.
+    /// Applies one input package. Registers keep NaN and infinite values as the client wrote them.
     pub fn apply_inputs(&mut self, values: &[(Field, Value)]) {
         let mut masked = Masked::default();
         for &(field, value) in values {

@@ -1,9 +1,7 @@
-//! `rtde_set_watchdog`: an input that must be written often enough, or the program pauses or stops.
-
-use super::robot::Robot;
-use graspd_rt::rtde::Field;
+//! `rtde_set_watchdog`: pauses or stops the program if an RTDE input is not written often enough.
 
 use crate::urscript::{HostError, WatchdogAction};
+use graspd_rt::rtde::Field;
 
 /// Watchdogs of the running program.
 #[derive(Clone, Debug, Default)]
@@ -17,8 +15,8 @@ struct Watchdog {
     fed_s: f64,
 }
 
-/// More than a script would ever set.
-const MOST: usize = 64;
+/// Watchdogs of one program.
+const MAX_WATCHDOGS: usize = 64;
 
 impl Watchdogs {
     /// Adds or replaces the watchdog of one input.
@@ -36,14 +34,14 @@ impl Watchdogs {
             return Err(HostError::Refused(format!("rtde_set_watchdog: {frequency} Hz is not a frequency")));
         }
         self.0.retain(|w| w.input != field);
-        // A frequency of zero takes the watchdog away.
-        if frequency > 0.0 && self.0.len() < MOST {
+        // A frequency of zero removes the watchdog.
+        if frequency > 0.0 && self.0.len() < MAX_WATCHDOGS {
             self.0.push(Watchdog { input: field, period_s: 1.0 / frequency, action, fed_s: now_s });
         }
         Ok(())
     }
 
-    /// Some client wrote `input`.
+    /// Notes that a client wrote `input`.
     pub(super) fn feed_field(&mut self, input: Field, now_s: f64) {
         for w in &mut self.0 {
             if w.input == input {
@@ -52,42 +50,23 @@ impl Watchdogs {
         }
     }
 
-    /// A paused program goes on: every watchdog starts afresh.
+    /// Restarts all watchdogs when a paused program resumes.
     pub(super) fn feed_all(&mut self, now_s: f64) {
         for w in &mut self.0 {
             w.fed_s = now_s;
         }
     }
 
-    /// All go away when the program stops.
+    /// Removes all watchdogs; called when the program ends.
     pub(super) fn clear(&mut self) {
         self.0.clear();
     }
 
-    /// The input and the action of a watchdog that has not been fed in time.
-    fn expired(&self, now_s: f64) -> Option<(Field, WatchdogAction)> {
+    /// Input and action of a watchdog whose input was not written in time.
+    pub(super) fn expired(&self, now_s: f64) -> Option<(Field, WatchdogAction)> {
         self.0
             .iter()
             .find(|w| w.action != WatchdogAction::Ignore && now_s - w.fed_s > w.period_s + 1e-9)
             .map(|w| (w.input, w.action))
-    }
-}
-
-impl Robot {
-    /// Pauses or stops the program when an input went silent.
-    pub(super) fn check_watchdogs(&mut self) {
-        if self.deaf_watchdog || !self.is_program_running() {
-            return;
-        }
-        let Some((input, action)) = self.watchdogs.expired(self.clock_s) else { return };
-        let text = format!("RTDE watchdog: input '{input}' was not written in time");
-        self.say(super::message::MessageKind::Runtime { line: 0, column: 0, text });
-        match action {
-            WatchdogAction::Stop => self.stop_program(),
-            WatchdogAction::Pause => {
-                self.pause_program();
-            }
-            WatchdogAction::Ignore => {}
-        }
     }
 }

@@ -1,39 +1,45 @@
-//! Robot, oracle and record together, with the faults that are on: everything behind the sockets.
+//! Robot, judge, wire record and active faults: everything behind the sockets.
 
 use super::command::{Command, Port, WireAction};
+use super::contact::ContactPlane;
 use super::judge::{Judge, Limits, StepSample};
-use super::link_faults::{RtdeFaults, WireFaults};
-use super::program::Upload;
+use super::link_faults::{RtdeFaults, WireFaults, later};
+use super::programs::Upload;
 use super::record::Recorder;
-use super::robot::Robot;
+use super::report::ReportFault;
+use super::robot::{JOINT_NUMBERS, Robot};
 use super::rtde_session::{InputPackage, Ownership};
-use super::state::{RobotMode, SafetyMode};
+use crate::plant::DriveFault;
 use serde_json::{Value as Json, json};
 use std::collections::BTreeMap;
+
+/// Random bytes of one `garbage` command.
+const MAX_NOISE_BYTES: usize = 65_536;
 
 /// Everything behind the sockets.
 pub struct World {
     /// The robot.
     pub robot: Robot,
-    /// Who holds which RTDE input.
+    /// Ownership of RTDE inputs.
     pub owners: Ownership,
-    /// The oracle.
+    /// The judge of set-points and motion.
     pub judge: Judge,
-    /// The wire record, when one is written.
+    /// The wire record, if one is written.
     pub recorder: Option<Recorder>,
-    /// Answers of the RTDE server that differ.
+    /// Faults of the RTDE server.
     pub rtde_faults: RtdeFaults,
-    /// What happens to the bytes of each port.
+    /// Network faults of each port.
     pub wire_faults: BTreeMap<Port, WireFaults>,
-    /// What the server shall do with its connections.
+    /// Pending actions on connections.
     pub actions: Vec<WireAction>,
-    /// A jump of the reported position that ends at this step.
+    /// Step at which a jump of the reported position ends.
     jump_until: Option<u64>,
     random: u64,
 }
 
 impl World {
-    /// A world round `robot`. `client` are the rate (rad/s) and acceleration (rad/s^2) that a client promised to keep.
+    /// A world with `robot`. `client` holds the joint speed (rad/s) and acceleration (rad/s^2) that clients must not
+    /// exceed.
     pub fn new(robot: Robot, client: Option<(f64, f64)>, recorder: Option<Recorder>) -> Self {
         let model = robot.setup.model;
         let (rate, accel) = client.unwrap_or((model.max_speed.iter().copied().fold(0.0, f64::max), f64::INFINITY));
@@ -52,7 +58,7 @@ impl World {
         }
     }
 
-    /// One control step at time `now_ns`.
+    /// Runs one control step at time `now_ns`.
     pub fn step(&mut self, now_ns: u64) {
         if self.jump_until.is_some_and(|end| self.robot.steps >= end) {
             self.robot.report_fault.offset = [0.0; 6];
@@ -72,7 +78,7 @@ impl World {
         }
     }
 
-    /// An input package took effect.
+    /// Judges and records an input package.
     pub fn note_input(judge: &mut Judge, recorder: &mut Option<Recorder>, now_ns: u64, package: &InputPackage) {
         judge.input(now_ns, &package.values);
         if let Some(recorder) = recorder {
@@ -80,27 +86,27 @@ impl World {
         }
     }
 
-    /// Notes an event in the record.
+    /// Records an event.
     pub fn note(&mut self, now_ns: u64, text: &str) {
         if let Some(recorder) = &mut self.recorder {
             recorder.note(now_ns, text);
         }
     }
 
-    /// A script came in.
-    pub fn upload(&mut self, now_ns: u64, text: &str) -> Upload {
-        let outcome = self.robot.upload(text);
+    /// Uploads a script and records the outcome.
+    pub fn upload(&mut self, now_ns: u64, text: &str, first_line: u32) -> Upload {
+        let outcome = self.robot.upload_at(text, first_line);
         let first = text.lines().find(|l| !l.trim().is_empty()).unwrap_or("");
         self.note(now_ns, &format!("script {outcome:?}: {first}"));
         outcome
     }
 
-    /// Faults of one port's wires.
+    /// Network faults of one port.
     pub fn wire(&self, port: Port) -> WireFaults {
         self.wire_faults.get(&port).cloned().unwrap_or_default()
     }
 
-    /// A repeatable random number in [0, 1).
+    /// A reproducible random number in [0, 1).
     pub fn random(&mut self) -> f64 {
         self.random ^= self.random << 13;
         self.random ^= self.random >> 7;
@@ -108,7 +114,7 @@ impl World {
         (self.random >> 11) as f64 / (1u64 << 53) as f64
     }
 
-    /// State and summary, for the control port.
+    /// The robot's state, for the control port.
     pub fn state(&self) -> Json {
         let r = &self.robot;
         json!({
@@ -138,17 +144,16 @@ impl World {
         })
     }
 
-    /// Carries out a command of the control port.
+    /// Executes a command of the control port.
     ///
     /// # Errors
-    /// In words, when the command cannot be carried out in this state.
+    /// The reason for which the command cannot be executed.
     pub fn command(&mut self, command: Command, now_ns: u64) -> Result<Json, String> {
         let text = serde_json::to_string(&command).unwrap_or_default();
         let is_query = matches!(command, Command::State | Command::Summary | Command::Ping);
         if !is_query {
             self.note(now_ns, &format!("command {text}"));
         }
-        let until = |seconds: f64| now_ns.saturating_add((seconds.clamp(0.0, 1e6) * 1e9) as u64);
         let robot = &mut self.robot;
         match command {
             Command::Ping => {}
@@ -156,10 +161,7 @@ impl World {
             Command::Summary => return serde_json::to_value(self.judge.summary()).map_err(|e| e.to_string()),
             Command::Limits { rate, accel } => self.judge.set_client_limits(rate, accel),
             Command::ProtectiveStop => robot.stop_protectively(0, 0),
-            Command::Collision { force } => {
-                robot.external_wrench = [force, 0.0, 0.0, 0.0, 0.0, 0.0];
-                robot.stop_protectively(153, 0);
-            }
+            Command::Collision { force } => robot.collide(force),
             Command::EmergencyStop { system } => robot.emergency_stop(system),
             Command::SafeguardStop => robot.safeguard_stop(),
             Command::SafetyFailure { fault } => robot.safety_failure(fault),
@@ -168,46 +170,20 @@ impl World {
             Command::Reduced { on } => robot.set_reduced(on),
             Command::RobotMode { mode } => robot.set_mode(mode),
             Command::PowerOff => robot.power_off(),
-            Command::Restore => {
-                robot.safety = SafetyMode::Normal;
-                robot.set_mode(RobotMode::Running);
-            }
+            Command::Restore => robot.restore(),
             Command::RemoteControl { on } => robot.remote_control = on,
-            Command::SpeedSlider { fraction } if (0.0..=1.0).contains(&fraction) => robot.slider = fraction,
-            Command::SpeedSlider { fraction } => return Err(format!("speed slider {fraction} is outside 0 to 1")),
+            Command::SpeedSlider { fraction } => robot.set_slider(fraction)?,
             Command::PauseProgram => drop(robot.pause_program()),
-            Command::PlayProgram => {
-                if !robot.play() {
-                    return Err("there is no program to play".to_owned());
-                }
-            }
+            Command::PlayProgram => robot.play().then_some(()).ok_or("no program is loaded or paused")?,
             Command::StopProgram => robot.stop_program(),
-            Command::Script { text } => {
-                if let Upload::Refused(reason) = self.upload(now_ns, &text) {
-                    return Err(reason);
-                }
-            }
+            Command::Script { text } => self.upload(now_ns, &text, 1).accepted()?,
             Command::NanPosition { joint } => robot.report_fault.nan_position = Some(joint),
             Command::NanSpeed { joint } => robot.report_fault.nan_speed = Some(joint),
-            Command::Jump { joint, rad, seconds } => {
-                let offset = robot.report_fault.offset.get_mut(joint).ok_or("joints are numbered 0 to 5")?;
-                *offset = rad;
-                self.jump_until = Some(robot.steps.saturating_add((seconds / robot.dt).max(1.0) as u64));
-            }
+            Command::Jump { joint, rad, seconds } => self.jump(joint, rad, seconds)?,
             Command::SwapJoints { a, b } => robot.report_fault.swapped = Some((a, b)),
-            Command::Drift { joint, rate } => {
-                if joint > 5 {
-                    return Err("joints are numbered 0 to 5".to_owned());
-                }
-                robot.set_drive_fault(|f| f.drift[joint] = rate);
-            }
+            Command::Drift { joint, rate } => robot.set_joint_fault(joint, |f| f.drift[joint] = rate)?,
             Command::Lag { seconds } => robot.set_drive_fault(|f| f.lag_s = seconds.clamp(0.0, 10.0)),
-            Command::Stuck { joint } => {
-                if joint > 5 {
-                    return Err("joints are numbered 0 to 5".to_owned());
-                }
-                robot.set_drive_fault(|f| f.stuck[joint] = true);
-            }
+            Command::Stuck { joint } => robot.set_joint_fault(joint, |f| f.stuck[joint] = true)?,
             Command::Teleport { q } => robot.teleport(q),
             Command::Payload { kg } => robot.payload.mass = kg,
             Command::Tcp { pose } => robot.tcp = pose,
@@ -216,6 +192,12 @@ impl World {
             Command::OutputInt { index, value } => {
                 *robot.outputs.ints.get_mut(index).ok_or("registers are numbered 0 to 47")? = value;
             }
+            Command::ContactPlane { point, normal, stiffness } => {
+                robot.contact_plane = Some(ContactPlane::new(point, normal, stiffness)?);
+            }
+            Command::ExternalWrench { wrench } => robot.external_wrench = wrench,
+            Command::ModbusSignal { name, value } => robot.devices.set_signal(&name, value)?,
+            Command::PortRegister { address, value } => robot.devices.set_port_register(address, value),
             Command::MuteOutputs { on } => robot.mute_outputs = on,
             Command::NoWatchdog { on } => robot.deaf_watchdog = on,
             Command::ClockRestart => robot.shift_clock(None),
@@ -225,48 +207,52 @@ impl World {
             Command::NotFound { names } => self.rtde_faults.not_found = names.into_iter().collect(),
             Command::WrongType { names } => self.rtde_faults.wrong_type = names.into_iter().collect(),
             Command::KeepOneOf { n } => self.rtde_faults.keep_one_of = n,
-            Command::Blackhole { port, seconds } => {
-                let wire = self.wire_faults.entry(port).or_default();
-                (wire.mute_until, wire.deaf_until) = (until(seconds), until(seconds));
-            }
-            Command::LoseUpstream { port, seconds } => {
-                self.wire_faults.entry(port).or_default().deaf_until = until(seconds);
-            }
-            Command::LoseDownstream { port, seconds } => {
-                self.wire_faults.entry(port).or_default().mute_until = until(seconds);
-            }
-            Command::Hold { port, seconds } => self.wire_faults.entry(port).or_default().hold_until = until(seconds),
-            Command::StopReading { port, seconds } => {
-                self.wire_faults.entry(port).or_default().unread_until = until(seconds);
-            }
-            Command::Delay { port, ms, jitter_ms } => {
-                let wire = self.wire_faults.entry(port).or_default();
-                wire.delay_ns = (ms.clamp(0.0, 60_000.0) * 1e6) as u64;
-                wire.jitter_ns = (jitter_ms.clamp(0.0, 60_000.0) * 1e6) as u64;
-            }
-            Command::Chunk { port, bytes } => self.wire_faults.entry(port).or_default().chunk = bytes,
-            Command::Refuse { port, on } => self.wire_faults.entry(port).or_default().refuse = on,
+            Command::Blackhole { port, seconds } => self.wire_fault(port).silence(now_ns, seconds, true, true),
+            Command::LoseUpstream { port, seconds } => self.wire_fault(port).silence(now_ns, seconds, true, false),
+            Command::LoseDownstream { port, seconds } => self.wire_fault(port).silence(now_ns, seconds, false, true),
+            Command::Hold { port, seconds } => self.wire_fault(port).hold_until = later(now_ns, seconds),
+            Command::StopReading { port, seconds } => self.wire_fault(port).unread_until = later(now_ns, seconds),
+            Command::Delay { port, ms, jitter_ms } => self.wire_fault(port).delay(ms, jitter_ms),
+            Command::Chunk { port, bytes } => self.wire_fault(port).chunk = bytes,
+            Command::Refuse { port, on } => self.wire_fault(port).refuse = on,
             Command::Reset { port } => self.actions.push(WireAction::Reset(port)),
             Command::Close { port } => self.actions.push(WireAction::Close(port)),
-            Command::Garbage { port, bytes } => {
-                let n = bytes.min(65_536);
-                let noise = (0..n).map(|_| (self.random() * 256.0) as u8).collect();
-                self.actions.push(WireAction::Inject(port, noise));
-            }
-            Command::WrongLength { port } => {
-                // Says two bytes, which is less than its own head.
-                self.actions.push(WireAction::Inject(port, vec![0, 2, 85]));
-            }
+            Command::Garbage { port, bytes } => self.inject_noise(port, bytes),
+            // A length of two bytes, less than the package header.
+            Command::WrongLength { port } => self.actions.push(WireAction::Inject(port, vec![0, 2, 85])),
             Command::UnknownType { port } => self.actions.push(WireAction::Inject(port, vec![0, 5, 0, 1, 2])),
-            Command::ClearFaults => {
-                robot.report_fault = super::report::ReportFault::default();
-                robot.set_drive_fault(|f| *f = crate::plant::DriveFault::default());
-                (robot.deaf_watchdog, robot.mute_outputs, robot.claimed_robot_type) = (false, false, None);
-                robot.external_wrench = [0.0; 6];
-                self.rtde_faults = RtdeFaults::default();
-                self.wire_faults.clear();
-            }
+            Command::ClearFaults => self.clear_faults(),
         }
         Ok(json!("done"))
+    }
+
+    fn wire_fault(&mut self, port: Port) -> &mut WireFaults {
+        self.wire_faults.entry(port).or_default()
+    }
+
+    /// Shifts the reported position of one joint by `rad` for `seconds`, one control step at least.
+    fn jump(&mut self, joint: usize, rad: f64, seconds: f64) -> Result<(), String> {
+        let offset = self.robot.report_fault.offset.get_mut(joint).ok_or(JOINT_NUMBERS)?;
+        *offset = rad;
+        self.jump_until = Some(self.robot.steps.saturating_add((seconds / self.robot.dt).max(1.0) as u64));
+        Ok(())
+    }
+
+    /// Sends random bytes between two packages of `port`.
+    fn inject_noise(&mut self, port: Port, bytes: usize) {
+        let n = bytes.min(MAX_NOISE_BYTES);
+        let noise = (0..n).map(|_| (self.random() * 256.0) as u8).collect();
+        self.actions.push(WireAction::Inject(port, noise));
+    }
+
+    /// Ends all faults except safety stops.
+    fn clear_faults(&mut self) {
+        let robot = &mut self.robot;
+        robot.report_fault = ReportFault::default();
+        robot.set_drive_fault(|f| *f = DriveFault::default());
+        (robot.deaf_watchdog, robot.mute_outputs, robot.claimed_robot_type) = (false, false, None);
+        (robot.external_wrench, robot.contact_plane) = ([0.0; 6], None);
+        self.rtde_faults = RtdeFaults::default();
+        self.wire_faults.clear();
     }
 }

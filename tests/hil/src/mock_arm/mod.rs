@@ -1,11 +1,11 @@
-//! The mock controller without sockets, on a virtual clock: the same plant, interpreter, RTDE server half and oracle, a step a
-//! call. A second of robot time takes milliseconds, and the same calls give the same bits.
+//! The mock controller without sockets, on a virtual clock: the same plant, interpreter, RTDE session and judge, one control
+//! step per call. A second of robot time takes milliseconds, and equal calls give bit-identical results.
 
 use crate::controller::{ClientId, Command, InputPackage, Robot, RtdeSession, Setup, Summary, Upload, World};
 use graspd_rt::rtde::{Field, FrameError, Value};
 use std::collections::BTreeMap;
 
-/// A robot in memory with its clients.
+/// A robot in memory with its RTDE clients.
 pub struct MockArm {
     world: World,
     clients: BTreeMap<ClientId, Client>,
@@ -19,19 +19,19 @@ struct Client {
     out: Vec<u8>,
 }
 
-/// A connection that was never made, or is over.
+/// A client is not connected.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum PeerError {
     /// No such client.
     #[error("client {0} is not connected")]
     NotConnected(ClientId),
-    /// Framing was lost; the connection is over.
-    #[error("the connection is over: {0}")]
+    /// Framing was lost; the connection was closed.
+    #[error("connection closed, RTDE framing lost: {0}")]
     Framing(FrameError),
 }
 
 impl MockArm {
-    /// A robot as `setup` says, held by the oracle to `limits` (rad/s, rad/s^2). The clock starts at one second.
+    /// A robot with this configuration, judged by `limits` (rad/s, rad/s^2). The clock starts at 1 s.
     pub fn new(setup: Setup, limits: Option<(f64, f64)>) -> Self {
         let robot = Robot::new(setup);
         let step_ns = (robot.dt * 1e9) as u64;
@@ -54,12 +54,12 @@ impl MockArm {
         &self.world.robot
     }
 
-    /// The robot, to set it up for a test.
+    /// The robot, for preparing a test.
     pub fn robot_mut(&mut self) -> &mut Robot {
         &mut self.world.robot
     }
 
-    /// Runs an uploaded script from the next step on.
+    /// Uploads a script; it runs from the next step on.
     pub fn upload(&mut self, text: &str) -> Upload {
         self.world.robot.upload(text)
     }
@@ -73,16 +73,16 @@ impl MockArm {
         id
     }
 
-    /// Ends a client's connection; what it held is free again.
+    /// Disconnects a client and releases its RTDE inputs.
     pub fn disconnect(&mut self, client: ClientId) {
         self.clients.remove(&client);
         self.world.owners.release(client);
     }
 
-    /// Bytes from a client to the controller, in any cut.
+    /// Sends bytes from a client to the controller, however they are split.
     ///
     /// # Errors
-    /// When there is no such client, or framing is lost: then it is disconnected.
+    /// There is no such client, or framing is lost (the client is then disconnected).
     pub fn send(&mut self, client: ClientId, bytes: &[u8]) -> Result<(), PeerError> {
         let Client { session, out } = self.clients.get_mut(&client).ok_or(PeerError::NotConnected(client))?;
         let World { robot, owners, rtde_faults, judge, .. } = &mut self.world;
@@ -95,23 +95,23 @@ impl MockArm {
         })
     }
 
-    /// Bytes from the controller to a client since the last call.
+    /// Bytes sent by the controller to a client since the last call.
     pub fn receive(&mut self, client: ClientId) -> Vec<u8> {
         self.clients.get_mut(&client).map(|c| std::mem::take(&mut c.out)).unwrap_or_default()
     }
 
-    /// Writes inputs as one package of a client would, without a connection.
+    /// Writes inputs like one RTDE package, without a connection.
     pub fn write_inputs(&mut self, values: &[(Field, Value)]) {
         self.world.robot.apply_inputs(values);
         self.world.judge.input(self.now_ns, values);
     }
 
-    /// One control step.
+    /// Runs one control step.
     pub fn step(&mut self) {
         self.now_ns += self.step_ns;
         self.world.step(self.now_ns);
         for client in self.clients.values_mut() {
-            // A client that does not collect its packages keeps the newest only.
+            // Bounds the memory of a client that does not collect its packages.
             if client.out.len() > 1 << 20 {
                 client.out.clear();
             }
@@ -119,7 +119,7 @@ impl MockArm {
         }
     }
 
-    /// Steps until `done` says so, or `seconds` have passed; true in the first case.
+    /// Steps until `done` returns true, at most `seconds`; false if it never did.
     pub fn step_until(&mut self, seconds: f64, mut done: impl FnMut(&Robot) -> bool) -> bool {
         for _ in 0..(seconds / self.world.robot.dt) as u64 {
             self.step();
@@ -130,15 +130,15 @@ impl MockArm {
         false
     }
 
-    /// A fault or another command of the control port; faults of the wires have no effect without wires.
+    /// Executes a command of the control port. Network faults have no effect here.
     ///
     /// # Errors
-    /// In words, when it cannot be carried out.
+    /// The reason for which the command cannot be executed.
     pub fn command(&mut self, command: Command) -> Result<serde_json::Value, String> {
         self.world.command(command, self.now_ns)
     }
 
-    /// What the oracle has seen.
+    /// The judge's summary.
     pub fn summary(&self) -> Summary {
         self.world.judge.summary()
     }

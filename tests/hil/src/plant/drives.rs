@@ -1,19 +1,19 @@
-//! The mechanical half: six joints that follow their targets with lag, limited acceleration and quantised encoders.
+//! The mechanical part: six joints that follow their targets with lag, limited acceleration and quantised encoders.
 
 use super::Joints;
 
-/// A disturbance of the joints, on command.
+/// A disturbance of the joints.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct DriveFault {
-    /// Extra time constant of the velocity loop, s: the arm trails its target.
+    /// Additional time constant of the velocity loop, s.
     pub lag_s: f64,
-    /// Joint rates added to whatever the loop asks, rad/s: the arm creeps without a command.
+    /// Joint speeds added to those of the velocity loop, rad/s: the arm drifts without a command.
     pub drift: Joints,
-    /// Joints that do not move at all.
+    /// Joints that do not move.
     pub stuck: [bool; 6],
 }
 
-/// Six joints with their own position and speed.
+/// Positions and speeds of six joints.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Drives {
     q: Joints,
@@ -21,21 +21,21 @@ pub struct Drives {
     /// Accelerations of the last step, rad/s^2.
     qdd: Joints,
     max_accel: f64,
-    /// What the motors turn at most, rad/s.
+    /// Largest joint speeds of the motors, rad/s.
     max_speed: Joints,
     fault: DriveFault,
     braked: bool,
-    /// How far the drift has carried each joint away from where its own loop believes it to be, rad.
+    /// Displacement by drift that the position loop does not see, rad.
     drifted: Joints,
 }
 
 /// Time constant of the velocity loop, s.
 const VELOCITY_LAG_S: f64 = 0.002;
-/// Position loop gain, 1/s: a quarter of the velocity loop's corner, which damps it critically.
+/// Position loop gain, 1/s: a quarter of the velocity loop's corner frequency, which gives critical damping.
 const POSITION_GAIN: f64 = 125.0;
-/// Share of a position error that one step may take away: keeps the loop stable at slow control rates.
-const MOST_IN_A_STEP: f64 = 0.5;
-/// Encoder counts a turn of the joint: 2^20.
+/// Largest fraction of a position error corrected in one step; keeps the loop stable at low control rates.
+const MAX_STEP_FRACTION: f64 = 0.5;
+/// Encoder counts per radian: 2^20 per turn of the joint.
 const COUNTS_PER_RAD: f64 = 1_048_576.0 / std::f64::consts::TAU;
 
 impl Drives {
@@ -53,14 +53,14 @@ impl Drives {
         }
     }
 
-    /// The same with motors that turn no faster than this.
+    /// Limits the joint speeds of the motors, rad/s.
     #[must_use]
     pub fn limited(mut self, max_speed: Joints) -> Self {
         self.max_speed = max_speed;
         self
     }
 
-    /// Puts a disturbance on the joints; the default takes it away.
+    /// Sets the disturbance of the joints; the default removes it.
     pub fn set_fault(&mut self, fault: DriveFault) {
         for i in 0..6 {
             if fault.drift[i] == 0.0 {
@@ -70,26 +70,26 @@ impl Drives {
         self.fault = fault;
     }
 
-    /// The disturbance now acting.
+    /// The present disturbance.
     pub fn fault(&self) -> &DriveFault {
         &self.fault
     }
 
-    /// Sets or frees the brakes. A brake holds the joint where it is; a moving joint is stopped at the acceleration limit.
+    /// Applies or releases the brakes. They hold a joint in place and stop a moving joint at the acceleration limit.
     pub fn set_brakes(&mut self, on: bool) {
         self.braked = on;
     }
 
-    /// One step towards the targets.
+    /// Advances by one control step towards the targets.
     pub fn step(&mut self, target_q: &Joints, target_qd: &Joints, dt: f64) {
         let blend = 1.0 - (-dt / (VELOCITY_LAG_S + self.fault.lag_s)).exp();
         let most = self.max_accel * dt;
-        let gain = (POSITION_GAIN / (1.0 + self.fault.lag_s / VELOCITY_LAG_S)).min(MOST_IN_A_STEP / dt);
+        let gain = (POSITION_GAIN / (1.0 + self.fault.lag_s / VELOCITY_LAG_S)).min(MAX_STEP_FRACTION / dt);
         for i in 0..6 {
-            let wanted =
+            let demanded =
                 if self.braked { 0.0 } else { target_qd[i] + gain * (target_q[i] - self.q[i] + self.drifted[i]) };
             let before = self.qd[i];
-            let change = if self.braked { -before } else { blend * (wanted - before) };
+            let change = if self.braked { -before } else { blend * (demanded - before) };
             self.qd[i] = (before + change.clamp(-most, most)).clamp(-self.max_speed[i], self.max_speed[i]);
             if self.fault.stuck[i] {
                 self.qd[i] = 0.0;
@@ -100,7 +100,7 @@ impl Drives {
         }
     }
 
-    /// Joint positions as the encoders read them, rad.
+    /// Joint positions read by the encoders, rad.
     pub fn read_q(&self) -> Joints {
         self.q.map(|q| (q * COUNTS_PER_RAD).round() / COUNTS_PER_RAD)
     }
@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn brakes_hold_and_a_stuck_joint_stays() {
+    fn brakes_hold_and_a_stuck_joint_does_not_move() {
         let mut d = Drives::new([0.1; 6], 40.0);
         d.set_brakes(true);
         d.step(&[1.0; 6], &[1.0; 6], 0.002);

@@ -1,161 +1,55 @@
-//! The controller half of motion: commands in, target joint positions out, one step at a time.
+//! The motion generator: motion commands in, joint targets out, one control step at a time.
 
+use super::compliance::Compliance;
+use super::leg::{Leg, Shape};
+use super::motion::{MAX_TARGET_ACCEL, Motion, REDUCED_SPEED_FRACTION, SAFETY_DECEL, StopCause};
 use super::path::CartesianPath;
 use super::profile::Profile;
 use super::{Joints, Kinematics, vector_to_pose};
 use nalgebra::{Isometry3, Vector3, Vector6};
 
-/// A motion command, as the URScript call of the same name gives it.
+/// The motion under way.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Motion {
-    /// `speedj`: reach and KEEP these joint rates (rad/s) until another motion; the leading axis accelerates at `accel`.
-    SpeedJ {
-        /// Joint rates, rad/s.
-        qd: Joints,
-        /// Acceleration of the leading axis, rad/s^2.
-        accel: f64,
-    },
-    /// `speedl`: reach and keep this tool velocity (linear then angular, base).
-    SpeedL {
-        /// m/s and rad/s.
-        twist: [f64; 6],
-        /// Linear acceleration, m/s^2.
-        accel: f64,
-        /// Angular acceleration, rad/s^2.
-        rot_accel: f64,
-    },
-    /// `servoj`: follow a joint position with about `lookahead` seconds of delay.
-    Servo {
-        /// Joint positions, rad.
-        q: Joints,
-        /// Smoothing time, s.
-        lookahead: f64,
-        /// Proportional gain; 300 is the default.
-        gain: f64,
-    },
-    /// `movej`: to joint positions, straight in joint space.
-    MoveJ {
-        /// Joint positions, rad.
-        q: Joints,
-        /// rad/s^2.
-        accel: f64,
-        /// rad/s.
-        speed: f64,
-        /// s; 0 leaves `speed` in charge.
-        duration: f64,
-    },
-    /// `movel` and `movep`: the tool to a pose (x, y, z, rotation vector), straight in space.
-    MoveL {
-        /// Tool pose in base.
-        pose: [f64; 6],
-        /// m/s^2.
-        accel: f64,
-        /// m/s.
-        speed: f64,
-        /// s; 0 leaves `speed` in charge.
-        duration: f64,
-    },
-    /// `movec`: the tool along the circle through `via`.
-    MoveC {
-        /// A pose on the way; only its position counts.
-        via: [f64; 6],
-        /// Tool pose at the end, base.
-        pose: [f64; 6],
-        /// m/s^2.
-        accel: f64,
-        /// m/s.
-        speed: f64,
-    },
-    /// `stopj`: joints to rest.
-    StopJ {
-        /// rad/s^2.
-        decel: f64,
-    },
-    /// `stopl`: tool to rest along its direction.
-    StopL {
-        /// m/s^2.
-        decel: f64,
-        /// rad/s^2.
-        rot_decel: f64,
-    },
-}
-
-/// Why the controller itself stops the arm.
-#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
-pub enum StopCause {
-    /// A joint was asked to turn faster than it may.
-    #[error("joint {joint} asked to turn at {speed:.3} rad/s, limit {limit:.3}")]
-    JointSpeed {
-        /// 0 is the base.
-        joint: usize,
-        /// rad/s.
-        speed: f64,
-        /// rad/s.
-        limit: f64,
-    },
-    /// A joint is about to run into its end stop.
-    #[error("joint {joint} at {position:.4} rad is close to its limit")]
-    JointPosition {
-        /// 0 is the base.
-        joint: usize,
-        /// rad.
-        position: f64,
-    },
-    /// A joint does not follow its target.
-    #[error("position of joint {joint} deviates from path by {deviation:.4} rad")]
-    PathDeviation {
-        /// 0 is the base.
-        joint: usize,
-        /// rad.
-        deviation: f64,
-    },
-    /// A tool path leaves the reach of the arm.
-    #[error("no inverse kinematics on the way to the target pose")]
-    Unreachable,
-}
-
-/// What is going on now.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Active {
+#[expect(
+    clippy::large_enum_variant,
+    reason = "one value per arm, copied once a step; a box would allocate in the step"
+)]
+pub(super) enum Active {
     Rest,
     Follow(Motion),
-    /// To rest at the given rate, then perhaps a move.
+    /// Decelerating to rest (rad/s^2 of the leading joint), then an optional move.
     Brake(f64, Option<Motion>),
-    Joint {
-        from: Joints,
-        to: Joints,
-        profile: Profile,
-    },
-    Tool {
-        path: CartesianPath,
-        profile: Profile,
+    /// A move.
+    Path(Leg),
+    /// The end of a move and the beginning of the next one: their displacements from `corner`, the end of the first, add up.
+    Blend {
+        tail: Leg,
+        lead: Leg,
+        corner: Joints,
     },
 }
 
-/// Largest acceleration of a target, rad/s^2: what Universal Robots' own control script asks for at most.
-pub(crate) const MAX_TARGET_ACCEL: f64 = 40.0;
-/// Deceleration of a stop by the safety system, rad/s^2.
-pub(crate) const SAFETY_DECEL: f64 = 20.0;
-/// How fast the speed scaling may change, 1/s.
-const SCALING_SLEW: f64 = 5.0;
-/// Largest linear deceleration of `StopL` and friends, m/s^2.
-const MAX_TOOL_ACCEL: f64 = 150.0;
-/// Share of the joint speed limits that reduced mode leaves.
-const REDUCED_SHARE: f64 = 0.5;
+/// Largest rate of change of the speed scaling, 1/s.
+const SCALING_SLEW_PER_S: f64 = 5.0;
 
-/// The motion generator: targets of six joints.
+/// Generates the targets of six joints.
 #[derive(Clone, Debug)]
 pub struct Generator {
-    q: Joints,
-    qd: Joints,
+    pub(super) q: Joints,
+    pub(super) qd: Joints,
     qdd: Joints,
-    active: Active,
-    scaling: f64,
-    max_speed: Joints,
+    pub(super) active: Active,
+    pub(super) scaling: f64,
+    pub(super) max_speed: Joints,
     position_limit: Joints,
-    reduced: bool,
-    kinematics: Kinematics,
-    tool: Isometry3<f64>,
+    pub(super) reduced: bool,
+    pub(super) kinematics: Kinematics,
+    pub(super) tool: Isometry3<f64>,
+    pub(super) compliance: Compliance,
+    /// Tool pose at the end of the present or the last move, base frame.
+    waypoint: Option<Isometry3<f64>>,
+    /// Blend radius of the move that is planned next, m.
+    next_blend_m: f64,
 }
 
 impl Generator {
@@ -172,6 +66,9 @@ impl Generator {
             reduced: false,
             kinematics,
             tool: Isometry3::identity(),
+            compliance: Compliance::default(),
+            waypoint: None,
+            next_blend_m: 0.0,
         }
     }
 
@@ -190,23 +87,36 @@ impl Generator {
         &self.qdd
     }
 
-    /// Speed scaling now in force, 0 to 1.
+    /// Present speed scaling, 0 to 1.
     pub fn scaling(&self) -> f64 {
         self.scaling
     }
 
-    /// `flange_from_tcp` used by tool motions.
+    /// Sets `flange_from_tcp` of tool motions.
     pub fn set_tool(&mut self, flange_from_tcp: Isometry3<f64>) {
         self.tool = flange_from_tcp;
     }
 
-    /// Halves the joint speed limits (a set-point beyond them is scaled down), or restores them.
+    /// Sets or ends reduced mode: half the joint speed limits; set-points beyond them are scaled down.
     pub fn set_reduced(&mut self, reduced: bool) {
         self.reduced = reduced;
     }
 
-    /// Starts a motion in place of the one before. A move begins after the arm came to rest.
+    /// Starts a motion, replacing the present one. A move begins once the arm is at rest.
     pub fn start(&mut self, motion: Motion) {
+        self.start_blended(motion, 0.0);
+    }
+
+    /// Starts a motion. Within `blend_m` of its end a move counts as settled, and the next move begins without a stop.
+    pub fn start_blended(&mut self, motion: Motion, blend_m: f64) {
+        if let Some(waypoint) = self.target(&motion) {
+            self.waypoint = Some(waypoint);
+            if let Some(blend) = self.blend(motion, blend_m) {
+                self.active = blend;
+                return;
+            }
+        }
+        self.next_blend_m = blend_m;
         self.active = match motion {
             Motion::SpeedJ { .. } | Motion::SpeedL { .. } | Motion::Servo { .. } | Motion::StopL { .. } => {
                 Active::Follow(motion)
@@ -217,29 +127,59 @@ impl Generator {
         };
     }
 
-    /// Brings the joints to rest as the safety system does.
+    /// Tool pose at the end of a move.
+    fn target(&self, motion: &Motion) -> Option<Isometry3<f64>> {
+        match motion {
+            Motion::MoveJ { q, .. } => Some(self.kinematics.forward(q) * self.tool),
+            Motion::MoveL { pose, .. } | Motion::MoveC { pose, .. } => Some(vector_to_pose(pose)),
+            _ => None,
+        }
+    }
+
+    /// The blend of the present move with the next one, if the present move has a blend radius and has not ended.
+    fn blend(&self, next: Motion, blend_m: f64) -> Option<Active> {
+        let Active::Path(tail) = self.active else { return None };
+        if tail.blend_m <= 0.0 || tail.profile.is_done() {
+            return None;
+        }
+        let corner = tail.last(&self.kinematics, &self.tool)?;
+        let lead = self.leg(next, corner, blend_m)?;
+        Some(Active::Blend { tail, lead, corner })
+    }
+
+    /// Tool pose at the end of the present or the last move; the present one before the first move.
+    pub fn waypoint(&self) -> Isometry3<f64> {
+        self.waypoint.unwrap_or_else(|| self.tool_pose())
+    }
+
+    /// Stops the joints with the deceleration of the safety system.
     pub fn safety_stop(&mut self) {
         self.active = Active::Brake(SAFETY_DECEL, None);
+        self.compliance.cancel();
     }
 
-    /// Puts the targets on the joints, at rest: after power came back or brakes opened.
+    /// Sets the targets to joint positions, at rest: after power on or brake release.
     pub fn snap(&mut self, q: Joints) {
         (self.q, self.qd, self.qdd, self.active) = (q, [0.0; 6], [0.0; 6], Active::Rest);
+        self.compliance.cancel();
     }
 
-    /// Brings a move to rest half way; speed and servo motions go on.
+    /// Stops a move before its end; speed and servo motions continue.
     pub fn abandon_move(&mut self) {
-        if matches!(self.active, Active::Joint { .. } | Active::Tool { .. } | Active::Brake(_, Some(_))) {
+        if matches!(self.active, Active::Path(_) | Active::Blend { .. } | Active::Brake(_, Some(_))) {
             self.active = Active::Brake(4.0, None);
         }
     }
 
-    /// Whether the motion has reached what it wanted: the end, rest, or the speed asked for.
+    /// Whether the motion has reached its goal: the end of the path, rest, or the commanded speed.
     pub fn is_settled(&self) -> bool {
         match &self.active {
             Active::Rest => true,
             Active::Brake(..) => false,
-            Active::Joint { profile, .. } | Active::Tool { profile, .. } => profile.is_done(),
+            Active::Path(leg) => {
+                leg.profile.is_done() || self.tool_pose().translation.vector.metric_distance(&leg.end) < leg.blend_m
+            }
+            Active::Blend { .. } => false,
             Active::Follow(Motion::SpeedJ { qd, .. }) => {
                 (0..6).all(|i| (self.qd[i] - qd[i] * self.scaling).abs() < 1e-9)
             }
@@ -255,31 +195,35 @@ impl Generator {
         }
     }
 
-    /// Whether all targets stand still.
+    /// Whether all target speeds are zero.
     pub fn at_rest(&self) -> bool {
         self.qd.iter().all(|v| v.abs() < 1e-6)
     }
 
-    /// Fraction of the move that is done, 0 to 1; 1 when no move is under way.
+    /// Completed fraction of the move, 0 to 1; 1 if no move is under way.
     pub fn progress(&self) -> f64 {
         match &self.active {
-            Active::Joint { profile, .. } | Active::Tool { profile, .. } => profile.fraction(),
+            Active::Path(leg) | Active::Blend { lead: leg, .. } => leg.profile.fraction(),
             Active::Brake(_, Some(_)) => 0.0,
             _ => 1.0,
         }
     }
 
-    /// Velocity of the tool by the targets: linear then angular, base.
+    /// Tool velocity of the targets: linear then angular, base frame.
     pub fn tool_velocity(&self) -> [f64; 6] {
         (self.kinematics.jacobian(&self.q, &self.tool) * Vector6::from_column_slice(&self.qd)).into()
     }
 
-    /// One control step. `wanted_scaling` (0 to 1) slows everything but a stop. Bounded work: at most one inverse kinematics.
-    pub fn step(&mut self, dt: f64, wanted_scaling: f64) -> Result<(), StopCause> {
-        let slew = SCALING_SLEW * dt;
-        self.scaling += (wanted_scaling.clamp(0.0, 1.0) - self.scaling).clamp(-slew, slew);
+    /// Advances by one control step. `requested_scaling` (0 to 1) slows every motion except stops. Computes at most one
+    /// inverse kinematics solution.
+    pub fn step(&mut self, dt: f64, requested_scaling: f64) -> Result<(), StopCause> {
+        let slew = SCALING_SLEW_PER_S * dt;
+        self.scaling += (requested_scaling.clamp(0.0, 1.0) - self.scaling).clamp(-slew, slew);
         let (q, qd) = (self.q, self.qd);
+        self.remove_compliance();
         let result = self.advance(dt);
+        let on_path = matches!(self.active, Active::Path(_) | Active::Blend { .. });
+        self.add_compliance(on_path, dt);
         if result.is_err() {
             (self.q, self.qd) = (q, qd);
             self.safety_stop();
@@ -287,8 +231,9 @@ impl Generator {
         }
         let result = result.and_then(|()| self.check(dt));
         if matches!(result, Err(StopCause::JointSpeed { .. })) {
-            // A target beyond the limit never reaches the drives: the stop begins from the one before.
+            // A target beyond the limit must not reach the drives: the stop begins from the previous target.
             (self.q, self.qd) = (q, qd);
+            self.compliance.cancel();
             self.brake(SAFETY_DECEL, dt);
         }
         self.qdd = std::array::from_fn(|i| (self.qd[i] - qd[i]) / dt);
@@ -307,142 +252,76 @@ impl Generator {
                 }
             }
             Active::Follow(motion) => self.follow(motion, dt)?,
-            Active::Joint { from, to, mut profile } => {
-                let was = profile.fraction();
-                profile.advance(dt * self.path_scaling());
-                let now = profile.fraction();
-                self.active = if profile.is_done() { Active::Rest } else { Active::Joint { from, to, profile } };
-                self.q = std::array::from_fn(|i| from[i] + (to[i] - from[i]) * now);
-                self.qd = std::array::from_fn(|i| (to[i] - from[i]) * (now - was) / dt);
-            }
-            Active::Tool { path, mut profile } => {
-                profile.advance(dt * self.path_scaling());
-                let goal = path.at(profile.fraction()) * self.tool.inverse();
-                let q = self.kinematics.inverse(&goal, &self.q).ok_or(StopCause::Unreachable)?;
+            Active::Path(mut leg) => {
+                let q = leg
+                    .advance(dt * self.path_scaling(), &self.kinematics, &self.tool)
+                    .ok_or(StopCause::Unreachable)?;
                 self.qd = std::array::from_fn(|i| (q[i] - self.q[i]) / dt);
                 self.q = q;
-                self.active = if profile.is_done() { Active::Rest } else { Active::Tool { path, profile } };
+                self.active = if leg.profile.is_done() { Active::Rest } else { Active::Path(leg) };
+            }
+            Active::Blend { mut tail, mut lead, corner } => {
+                let path_dt = dt * self.path_scaling();
+                let advance = |leg: &mut Leg| leg.advance(path_dt, &self.kinematics, &self.tool);
+                let (a, b) = advance(&mut tail).zip(advance(&mut lead)).ok_or(StopCause::Unreachable)?;
+                let q: Joints = std::array::from_fn(|i| a[i] + b[i] - corner[i]);
+                self.qd = std::array::from_fn(|i| (q[i] - self.q[i]) / dt);
+                self.q = q;
+                self.active = match (tail.profile.is_done(), lead.profile.is_done()) {
+                    (true, true) => Active::Rest,
+                    (true, false) => Active::Path(lead),
+                    _ => Active::Blend { tail, lead, corner },
+                };
             }
         }
         Ok(())
     }
 
     fn path_scaling(&self) -> f64 {
-        self.scaling * if self.reduced { REDUCED_SHARE } else { 1.0 }
+        self.scaling * if self.reduced { REDUCED_SPEED_FRACTION } else { 1.0 }
     }
 
-    /// Turns a waiting move into a path from where the arm now rests.
+    /// Plans a move from the present position, where the arm is at rest.
     fn plan(&self, motion: Motion) -> Active {
-        match motion {
+        self.leg(motion, self.q, self.next_blend_m).map_or(Active::Rest, Active::Path)
+    }
+
+    /// Plans a move that begins at `start`; `None` for other motions.
+    fn leg(&self, motion: Motion, start: Joints, blend_m: f64) -> Option<Leg> {
+        let from = self.kinematics.forward(&start) * self.tool;
+        let (shape, profile) = match motion {
             Motion::MoveJ { q, accel, speed, duration } => {
-                let far = (0..6).map(|i| (q[i] - self.q[i]).abs()).fold(0.0, f64::max);
-                // A joint slower than the leading one's speed may still be beyond its own limit: the whole move slows down.
+                let far = (0..6).map(|i| (q[i] - start[i]).abs()).fold(0.0, f64::max);
+                // Joints have different speed limits: the move is slowed down until no joint exceeds its own.
                 let allowed = (0..6)
-                    .map(|i| self.max_speed[i] * far / (q[i] - self.q[i]).abs().max(1e-12))
+                    .map(|i| self.max_speed[i] * far / (q[i] - start[i]).abs().max(1e-12))
                     .fold(speed.abs(), f64::min);
                 let accel = accel.abs().min(MAX_TARGET_ACCEL);
-                Active::Joint { from: self.q, to: q, profile: Profile::new(far, allowed, accel, duration) }
+                (Shape::Joint { from: start, to: q }, Profile::new(far, allowed, accel, duration))
             }
             Motion::MoveL { pose, accel, speed, duration } => {
-                let path = CartesianPath::Line { from: self.tool_pose(), to: vector_to_pose(&pose) };
-                Active::Tool { path, profile: Profile::new(path.length(), speed, accel, duration) }
+                let path = CartesianPath::Line { from, to: vector_to_pose(&pose) };
+                (Shape::Tool(path), Profile::new(path.length(), speed, accel, duration))
             }
             Motion::MoveC { via, pose, accel, speed } => {
                 let via = Vector3::new(via[0], via[1], via[2]);
-                let path = CartesianPath::arc(self.tool_pose(), via, vector_to_pose(&pose));
-                Active::Tool { path, profile: Profile::new(path.length(), speed, accel, 0.0) }
+                let path = CartesianPath::arc(from, via, vector_to_pose(&pose));
+                (Shape::Tool(path), Profile::new(path.length(), speed, accel, 0.0))
             }
-            _ => Active::Rest,
-        }
+            _ => return None,
+        };
+        let end = self.target(&motion)?.translation.vector;
+        // A blend radius above half the length would begin the next move before this one has got under way.
+        let blend_m = blend_m.max(0.0).min(0.5 * end.metric_distance(&from.translation.vector));
+        Some(Leg { shape, profile, q: start, end, blend_m })
     }
 
-    /// Tool pose by the targets.
+    /// Tool pose of the targets.
     pub fn tool_pose(&self) -> Isometry3<f64> {
         self.kinematics.forward(&self.q) * self.tool
     }
 
-    /// Slows the joints, the leading one at `decel`; true at rest.
-    fn brake(&mut self, decel: f64, dt: f64) -> bool {
-        let goal = [0.0; 6];
-        self.approach(&goal, decel, dt);
-        self.qd.iter().all(|v| *v == 0.0)
-    }
-
-    /// Moves the joint speeds straight towards `goal`, the leading axis at `accel`, and integrates.
-    fn approach(&mut self, goal: &Joints, accel: f64, dt: f64) {
-        let most = accel.abs().clamp(1e-3, MAX_TARGET_ACCEL) * dt;
-        let delta: Joints = std::array::from_fn(|i| goal[i] - self.qd[i]);
-        let lead = delta.iter().fold(0.0f64, |m, d| m.max(d.abs()));
-        if lead <= most {
-            self.qd = *goal;
-        } else {
-            let share = most / lead;
-            self.qd = std::array::from_fn(|i| self.qd[i] + delta[i] * share);
-        }
-        for i in 0..6 {
-            self.q[i] += self.qd[i] * dt;
-        }
-    }
-
-    fn follow(&mut self, motion: Motion, dt: f64) -> Result<(), StopCause> {
-        match motion {
-            Motion::SpeedJ { qd, accel } => {
-                let goal = self.reduce(qd.map(|v| v * self.scaling));
-                self.approach(&goal, accel, dt);
-            }
-            Motion::SpeedL { twist, accel, rot_accel } => self.tool_follow(&twist, accel, rot_accel, dt),
-            Motion::StopL { decel, rot_decel } => {
-                self.tool_follow(&[0.0; 6], decel, rot_decel, dt);
-                if self.tool_velocity().iter().all(|v| v.abs() < 1e-4) && self.brake(SAFETY_DECEL, dt) {
-                    self.active = Active::Rest;
-                }
-            }
-            Motion::Servo { q, lookahead, gain } => {
-                let settle = (lookahead.clamp(0.03, 0.2) * (300.0 / gain.clamp(100.0, 2000.0)).sqrt()).max(2.0 * dt);
-                // As fast as the lookahead asks, but never faster than the arm can still brake.
-                let goal = std::array::from_fn(|i| {
-                    let e = q[i] - self.q[i];
-                    let can_brake = (2.0 * 0.8 * MAX_TARGET_ACCEL * e.abs()).sqrt();
-                    let v = (e / settle).clamp(-can_brake, can_brake);
-                    v.clamp(-self.max_speed[i], self.max_speed[i]) * self.scaling
-                });
-                let goal = self.reduce(goal);
-                let most = MAX_TARGET_ACCEL * dt;
-                for ((q, qd), goal) in self.q.iter_mut().zip(&mut self.qd).zip(goal) {
-                    *qd += (goal - *qd).clamp(-most, most);
-                    *q += *qd * dt;
-                }
-            }
-            _ => {}
-        }
-        Ok(())
-    }
-
-    fn tool_follow(&mut self, twist: &[f64; 6], accel: f64, rot_accel: f64, dt: f64) {
-        let now = Vector6::from(self.tool_velocity());
-        let mut next = now;
-        for (rows, rate) in [(0, accel.abs().min(MAX_TOOL_ACCEL)), (3, rot_accel.abs().min(MAX_TOOL_ACCEL))] {
-            let goal = Vector3::new(twist[rows], twist[rows + 1], twist[rows + 2]) * self.scaling;
-            let have = now.fixed_rows::<3>(rows).into_owned();
-            let delta = goal - have;
-            let most = rate.max(1e-3) * dt;
-            let share = if delta.norm() <= most { 1.0 } else { most / delta.norm() };
-            next.fixed_rows_mut::<3>(rows).copy_from(&(have + delta * share));
-        }
-        let goal = self.reduce(self.kinematics.joint_rates(&self.q, &self.tool, &next.into()));
-        self.approach(&goal, MAX_TARGET_ACCEL, dt);
-    }
-
-    /// Scales joint rates into the reduced limits, keeping their direction.
-    fn reduce(&self, qd: Joints) -> Joints {
-        if !self.reduced {
-            return qd;
-        }
-        let over = (0..6).map(|i| qd[i].abs() / (self.max_speed[i] * REDUCED_SHARE)).fold(1.0, f64::max);
-        qd.map(|v| v / over)
-    }
-
-    /// Speed limits, and position limits with room left to brake.
+    /// Checks speed limits, and position limits with the braking distance.
     fn check(&mut self, dt: f64) -> Result<(), StopCause> {
         for i in 0..6 {
             let (q, qd, limit) = (self.q[i], self.qd[i], self.max_speed[i]);
@@ -455,7 +334,7 @@ impl Generator {
                 continue;
             };
             if matches!(self.active, Active::Brake(_, None)) {
-                continue; // already stopping
+                continue; // the arm is stopping already
             }
             self.safety_stop();
             return Err(cause);
@@ -484,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn speedj_keeps_moving_until_told_otherwise() {
+    fn speedj_continues_until_the_next_motion() {
         let mut g = generator();
         g.start(Motion::SpeedJ { qd: [0.2, 0.0, -0.1, 0.0, 0.0, 0.0], accel: 2.0 });
         run(&mut g, 2.0).unwrap();
@@ -496,7 +375,7 @@ mod tests {
     }
 
     #[test]
-    fn movej_and_movel_arrive_where_they_were_sent() {
+    fn movej_and_movel_reach_their_targets() {
         let mut g = generator();
         let to = [0.5, -1.0, 1.2, -1.0, 1.3, 0.0];
         g.start(Motion::MoveJ { q: to, accel: 1.4, speed: 1.05, duration: 0.0 });
@@ -538,7 +417,7 @@ mod tests {
     }
 
     #[test]
-    fn runs_into_no_end_stop_and_no_speed_limit() {
+    fn stops_before_position_and_speed_limits() {
         let mut g = generator();
         g.start(Motion::SpeedJ { qd: [2.0, 0.0, 0.0, 0.0, 0.0, 0.0], accel: 10.0 });
         assert!(matches!(run(&mut g, 4.0), Err(StopCause::JointPosition { joint: 0, .. })));
@@ -550,7 +429,7 @@ mod tests {
     }
 
     #[test]
-    fn the_slider_slows_and_reduced_mode_caps() {
+    fn the_slider_scales_and_reduced_mode_limits_the_speed() {
         let mut g = generator();
         g.start(Motion::SpeedJ { qd: [1.0; 6], accel: 10.0 });
         for _ in 0..500 {

@@ -1,12 +1,13 @@
-//! Joint torques that hold the arm against gravity, from point masses: enough for currents and moments that look like an arm's.
+//! Gravity torques of the joints from point masses: accurate enough for plausible currents and moments.
 
 use super::{Joints, Kinematics};
 use nalgebra::{Isometry3, Vector3};
 
-/// Torques in Nm that hold the links (at the middle of each) and a payload at the flange, base upright.
+/// Joint torques (Nm) that hold the links and a payload (kg, at the flange) against gravity, base upright. Each link is a
+/// point mass at its middle.
 pub fn gravity_torques(kinematics: &Kinematics, masses: &Joints, payload: f64, q: &Joints) -> Joints {
     let mut torque = [0.0; 6];
-    // A link's mass sits half way back along its own a and d: found as a tool of the shortened chain.
+    // The middle of a link is the flange of a chain that ends after half of its a and d.
     for (link, own_mass) in masses.iter().enumerate() {
         let mut part = *kinematics;
         for row in &mut part.rows[link..] {
@@ -30,7 +31,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_shoulder_carries_an_outstretched_arm_and_nothing_upright() {
+    fn the_shoulder_torque_is_large_for_a_stretched_arm_and_small_for_an_upright_one() {
         let m = Model::by_name("ur5e").unwrap();
         let k = m.nominal();
         let out = gravity_torques(&k, &m.masses, 0.0, &[0.0; 6]);

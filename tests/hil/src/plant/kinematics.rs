@@ -1,7 +1,7 @@
-//! Forward and inverse kinematics of the simulated arm, written apart from the daemon's.
+//! Forward and inverse kinematics of the simulated arm, independent of the daemon's.
 //!
-//! The daemon's kinematics are what the mock is there to judge, so this second, plain implementation shares no code with them: a
-//! sign that is wrong in one of the two shows as a disagreement.
+//! The mock exists to test the daemon's kinematics, so this second implementation shares no code with them: a wrong sign in
+//! either shows as a disagreement.
 
 use super::Joints;
 use nalgebra::{Isometry3, Matrix4, Matrix6, Rotation3, Translation3, UnitQuaternion, Vector3, Vector6};
@@ -27,17 +27,19 @@ pub struct Kinematics {
     pub rows: [DhRow; 6],
 }
 
-/// A file of calibrated DH parameters that cannot be used.
+/// A file of calibrated DH parameters could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum KinematicsFileError {
     /// The file cannot be read.
-    #[error("kinematics file {0}: {1}; give a readable TOML file")]
+    #[error("kinematics file {0}: {1}; check the path and its permissions")]
     Read(PathBuf, std::io::Error),
     /// The file is not the expected TOML.
-    #[error("kinematics file {0}: {1}; expected tables of six numbers a, d, alpha, theta")]
+    #[error("kinematics file {0}: {1}; expected a table dh with lists a, d, alpha and theta of six numbers each")]
     Parse(PathBuf, Box<toml::de::Error>),
-    /// A number is not finite or absurd.
-    #[error("kinematics file {0}: {1}[{2}] = {3} is not a link of an arm; lengths lie within 3 m, angles within 7 rad")]
+    /// A number is out of range.
+    #[error(
+        "kinematics file {0}: {1}[{2}] = {3} is out of range: lengths up to 3 m, angles up to 7 rad; check the units"
+    )]
     Value(PathBuf, &'static str, usize, f64),
 }
 
@@ -54,13 +56,13 @@ struct DhTable {
     theta: [f64; 6],
 }
 
-/// Iterations of one inverse-kinematics attempt.
+/// Newton iterations of one inverse kinematics attempt.
 const IK_ITERATIONS: usize = 60;
-/// Attempts from other elbows and wrists after the near one failed.
+/// Attempts from other arm configurations after the attempt from nearby joints failed.
 const IK_SEEDS: usize = 24;
 
 impl Kinematics {
-    /// Reads a `[dh]` table with `a`, `d`, `alpha`, `theta` of six numbers each (metres, radians; `theta` is the zero offset).
+    /// Reads a `[dh]` table with `a`, `d`, `alpha`, `theta` of six numbers each (m, rad; `theta` is the joint zero offset).
     pub fn from_file(path: &Path) -> Result<Self, KinematicsFileError> {
         let text = std::fs::read_to_string(path).map_err(|e| KinematicsFileError::Read(path.to_owned(), e))?;
         let file: DhFile =
@@ -102,13 +104,13 @@ impl Kinematics {
         isometry(&self.frames(q)[6])
     }
 
-    /// Origin of the frame after the elbow joint, metres in base.
+    /// Origin of the frame after the elbow joint, m, base frame.
     pub fn elbow(&self, q: &Joints) -> Vector3<f64> {
         let f = &self.frames(q)[2];
         Vector3::new(f[(0, 3)], f[(1, 3)], f[(2, 3)])
     }
 
-    /// Jacobian of the point `flange_from_tcp` with respect to the joints: rows are linear then angular velocity in base.
+    /// Geometric Jacobian at `flange_from_tcp`: rows are linear then angular velocity in the base frame.
     pub fn jacobian(&self, q: &Joints, flange_from_tcp: &Isometry3<f64>) -> Matrix6<f64> {
         let frames = self.frames(q);
         let tip = (isometry(&frames[6]) * flange_from_tcp).translation.vector;
@@ -123,19 +125,19 @@ impl Kinematics {
         j
     }
 
-    /// Joint rates for a velocity of the tool (linear then angular, base), damped near singularities.
+    /// Joint speeds for a tool velocity (linear then angular, base frame), damped near singularities.
     pub fn joint_rates(&self, q: &Joints, flange_from_tcp: &Isometry3<f64>, twist: &[f64; 6]) -> Joints {
         let j = self.jacobian(q, flange_from_tcp);
         damped_solve(&j, &Vector6::from_column_slice(twist), 1e-4).into()
     }
 
-    /// Joints that put `base_from_flange` at `goal`, nearest to `near` first; `None` when no attempt converges.
+    /// Joint positions for `base_from_flange = goal`, preferably near `near`; `None` if no attempt converges.
     pub fn inverse(&self, goal: &Isometry3<f64>, near: &Joints) -> Option<Joints> {
         if let Some(q) = self.refine(goal, near) {
             return Some(q);
         }
         (0..IK_SEEDS).find_map(|k| {
-            // Elbow up and down, shoulder left and right, wrist flipped, in turn: a lattice, so that the answer is repeatable.
+            // Shoulder left and right, elbow up and down, wrist flipped: a fixed lattice, so that results are reproducible.
             let pick = |shift: usize, values: &[f64]| values[(k >> shift) % values.len()];
             let base = goal.translation.y.atan2(goal.translation.x);
             let seed = [
@@ -150,7 +152,7 @@ impl Kinematics {
         })
     }
 
-    /// Newton's method from `seed`, damped, at most [`IK_ITERATIONS`] steps.
+    /// Damped Newton iterations from `seed`.
     fn refine(&self, goal: &Isometry3<f64>, seed: &Joints) -> Option<Joints> {
         let mut q = Vector6::from_column_slice(seed);
         let tool = Isometry3::identity();
@@ -177,19 +179,19 @@ impl Kinematics {
     }
 }
 
-/// Turns each joint by whole turns towards `near`.
+/// Shifts each joint by whole turns towards `near`.
 fn wrap_near(q: Joints, near: &Joints) -> Joints {
     std::array::from_fn(|i| q[i] - ((q[i] - near[i]) / std::f64::consts::TAU).round() * std::f64::consts::TAU)
 }
 
-/// Linear and angular difference in base that leads from `from` to `to`.
+/// Linear and angular difference from `from` to `to` in the base frame.
 fn pose_error(from: &Isometry3<f64>, to: &Isometry3<f64>) -> Vector6<f64> {
     let linear = to.translation.vector - from.translation.vector;
     let angular = (to.rotation * from.rotation.inverse()).scaled_axis();
     Vector6::new(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
 }
 
-/// `(J^T J + damping I)^-1 J^T b`; zero when even the damped system cannot be solved.
+/// `(J^T J + damping^2 I)^-1 J^T b`; zero if the damped system is still singular.
 fn damped_solve(j: &Matrix6<f64>, b: &Vector6<f64>, damping: f64) -> Vector6<f64> {
     let normal = j.transpose() * j + Matrix6::identity() * damping * damping;
     normal.cholesky().map_or_else(Vector6::zeros, |c| c.solve(&(j.transpose() * b)))
@@ -200,7 +202,7 @@ fn isometry(m: &Matrix4<f64>) -> Isometry3<f64> {
     Isometry3::from_parts(Translation3::new(m[(0, 3)], m[(1, 3)], m[(2, 3)]), UnitQuaternion::from_rotation_matrix(&r))
 }
 
-/// A pose as the controller writes it: x, y, z in metres, then the rotation vector in radians.
+/// A pose in the controller's form: x, y, z in m, then the rotation vector in rad.
 pub fn pose_to_vector(pose: &Isometry3<f64>) -> [f64; 6] {
     let (t, r) = (pose.translation.vector, pose.rotation.scaled_axis());
     [t.x, t.y, t.z, r.x, r.y, r.z]
@@ -217,7 +219,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ur5e_outstretched_is_where_the_table_says() {
+    fn ur5e_at_zero_joints_matches_the_dh_table() {
         // All joints zero: the arm lies along -x, so x = a2 + a3, y = -(d4 + d6), z = d1 - d5.
         let p = Model::by_name("ur5e").unwrap().nominal().forward(&[0.0; 6]).translation.vector;
         assert!((p - Vector3::new(-0.8172, -0.2329, 0.0628)).norm() < 1e-12, "{p}");

@@ -1,10 +1,10 @@
-//! The arms that the mock can be: one row a model, from the published tables.
+//! Arm models from the published tables.
 
 use super::Joints;
 use super::kinematics::{DhRow, Kinematics};
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-/// Which control box drives the arm.
+/// Generation of the control box.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Generation {
     /// CB3: 125 Hz, software 3.15.
@@ -13,12 +13,12 @@ pub enum Generation {
     ESeries,
 }
 
-/// A model of arm: geometry, limits, identity.
+/// An arm model: geometry, limits, identity.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Model {
-    /// Name as on the command line, for example `ur5e`.
+    /// Name on the command line, for example `ur5e`.
     pub name: &'static str,
-    /// What the dashboard answers to `get robot model`.
+    /// Answer of the dashboard to `get robot model`.
     pub dashboard_name: &'static str,
     /// Control box.
     pub generation: Generation,
@@ -30,7 +30,7 @@ pub struct Model {
     pub max_speed: Joints,
     /// Largest joint torques, Nm.
     pub max_torque: Joints,
-    /// Masses of shoulder, upper arm, forearm, wrists 1 to 3, kg.
+    /// Masses of shoulder, upper arm, forearm and wrists 1 to 3, kg.
     pub masses: Joints,
     /// Whether wrist 3 turns without limit.
     pub unlimited_wrist: bool,
@@ -38,9 +38,9 @@ pub struct Model {
     pub max_payload: f64,
 }
 
-/// No arm of that name.
+/// There is no arm model of this name.
 #[derive(Debug, thiserror::Error)]
-#[error("no arm model `{0}`; known models: ur3, ur5, ur10, ur3e, ur5e, ur10e, ur16e, ur20, ur30")]
+#[error("unknown arm model `{0}`; known models: ur3, ur5, ur10, ur3e, ur5e, ur10e, ur16e, ur20, ur30")]
 pub struct UnknownModel(pub String);
 
 const fn degrees(v: [f64; 6]) -> Joints {
@@ -54,7 +54,8 @@ const UR10_SPEED: Joints = degrees([120.0, 120.0, 180.0, 180.0, 180.0, 180.0]);
 const UR20_SPEED: Joints = degrees([120.0, 120.0, 150.0, 210.0, 210.0, 210.0]);
 const UR20_TORQUE: Joints = [738.0, 738.0, 433.0, 107.0, 107.0, 107.0];
 
-/// Source: the fact sheet's kinematics, limit and mass tables (ROS 2 description 2.4.5; Universal Robots' DH article).
+/// Sources: UR's ROS 2 description 2.4.5 (limits, masses) and UR's article "DH Parameters for calculations of kinematics and
+/// dynamics".
 const MODELS: [Model; 9] = [
     Model {
         name: "ur3",
@@ -167,7 +168,7 @@ const MODELS: [Model; 9] = [
 ];
 
 impl Model {
-    /// The model of that name.
+    /// The model of this name.
     pub fn by_name(name: &str) -> Result<Model, UnknownModel> {
         MODELS.iter().find(|m| m.name == name).copied().ok_or_else(|| UnknownModel(name.to_owned()))
     }
@@ -193,7 +194,7 @@ impl Model {
         }
     }
 
-    /// Largest joint position either way, rad (360 degrees; wrist 3 of the UR3 family is unlimited, given here as 1000 turns).
+    /// Largest absolute joint positions, rad: 360 degrees, and 1000 turns for the unlimited wrist 3 of the UR3 family.
     pub fn position_limit(&self) -> Joints {
         let mut limit = [TAU; 6];
         if self.unlimited_wrist {
@@ -202,7 +203,7 @@ impl Model {
         limit
     }
 
-    /// Rate of the control step, Hz.
+    /// Control rate, Hz.
     pub fn rate_hz(&self) -> f64 {
         match self.generation {
             Generation::Cb3 => 125.0,

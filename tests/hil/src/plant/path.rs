@@ -1,29 +1,29 @@
-//! Tool paths: a straight line, an arc through three points.
+//! Tool paths: a straight line, or an arc through three points.
 
 use nalgebra::{Isometry3, Point3, Translation3, Unit, UnitQuaternion, Vector3};
 
-/// Metres of path that a radian of tool rotation counts for, so that a pure rotation has a length too.
+/// Path length of one radian of tool rotation, m, so that a pure rotation has a length.
 const METRES_PER_RADIAN: f64 = 0.3;
 
-/// A path of the tool in base.
+/// A path of the tool in the base frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum CartesianPath {
-    /// Straight, rotation about one fixed axis.
+    /// A straight line with a rotation about one fixed axis.
     Line {
-        /// Where the tool starts.
+        /// Start pose.
         from: Isometry3<f64>,
-        /// Where it ends.
+        /// End pose.
         to: Isometry3<f64>,
     },
-    /// Part of a circle, rotation about one fixed axis.
+    /// An arc with a rotation about one fixed axis.
     Arc {
-        /// Where the tool starts.
+        /// Start pose.
         from: Isometry3<f64>,
-        /// Where it ends.
+        /// End pose.
         to: Isometry3<f64>,
         /// Centre of the circle.
         centre: Point3<f64>,
-        /// Axis about which the tool travels, right-handed.
+        /// Axis of the circle; the tool travels counter-clockwise about it.
         axis: Unit<Vector3<f64>>,
         /// Angle travelled, rad.
         angle: f64,
@@ -31,7 +31,7 @@ pub enum CartesianPath {
 }
 
 impl CartesianPath {
-    /// The circle through `from`, `via` and `to`; a line when the three points are in line.
+    /// The arc through `from`, `via` and `to`; a line if the three points are collinear.
     pub fn arc(from: Isometry3<f64>, via: Vector3<f64>, to: Isometry3<f64>) -> Self {
         let a = from.translation.vector;
         let (u, v) = (via - a, to.translation.vector - a);
@@ -47,7 +47,7 @@ impl CartesianPath {
         CartesianPath::Arc { from, to, centre: centre.into(), axis, angle }
     }
 
-    /// Length of the path in metres, rotation counted in.
+    /// Path length, m, including rotation.
     pub fn length(&self) -> f64 {
         match self {
             CartesianPath::Line { from, to } => {
@@ -61,7 +61,7 @@ impl CartesianPath {
         }
     }
 
-    /// The pose at `fraction` (0 to 1) of the path.
+    /// Pose at `fraction` (0 to 1) of the path.
     pub fn at(&self, fraction: f64) -> Isometry3<f64> {
         match self {
             CartesianPath::Line { from, to } => {
@@ -86,7 +86,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_arc_passes_its_three_points() {
+    fn an_arc_passes_through_its_three_points() {
         let from = Isometry3::translation(1.0, 0.0, 0.0);
         let to = Isometry3::new(Vector3::new(-1.0, 0.0, 0.0), Vector3::new(0.0, 0.0, 1.0));
         let path = CartesianPath::arc(from, Vector3::new(0.0, 1.0, 0.0), to);

@@ -1,6 +1,6 @@
-//! A trapezoidal speed profile along a path, advanced in scaled time.
+//! Trapezoidal speed profile along a path.
 
-/// Position along a path of a given length with limited speed and acceleration, starting and ending at rest.
+/// Position along a path with limited speed and acceleration, starting and ending at rest.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Profile {
     length: f64,
@@ -10,19 +10,19 @@ pub struct Profile {
 }
 
 impl Profile {
-    /// A move over `length` (0 or more) with acceleration `accel` and top speed `speed`, both made positive.
+    /// A move over `length` (at least 0) with acceleration `accel` and speed `speed`; their absolute values are used.
     ///
-    /// With `duration` above zero the top speed is chosen so that the move takes that long, or as fast as `accel` allows when
-    /// that is impossible.
+    /// With a `duration` above zero the speed is chosen so that the move takes that long. If `accel` does not permit it,
+    /// the move takes the shortest possible time.
     pub fn new(length: f64, speed: f64, accel: f64, duration: f64) -> Self {
         let accel = accel.abs().max(1e-6);
         let mut speed = speed.abs().max(1e-6);
         if duration > 0.0 {
-            // length = v (duration - v / a): the smaller root is the trapezoid.
+            // length = v (duration - v / a): the smaller root is the trapezoidal profile.
             let root = accel * accel * duration * duration - 4.0 * accel * length;
             speed = if root > 0.0 { (accel * duration - root.sqrt()) / 2.0 } else { (accel * length).sqrt() };
         }
-        // A short move never reaches the top speed.
+        // A short move has a triangular profile.
         let speed = speed.min((accel * length).sqrt()).max(1e-9);
         Profile { length, speed, accel, time: 0.0 }
     }
@@ -32,18 +32,18 @@ impl Profile {
         if self.length <= 0.0 { 0.0 } else { self.length / self.speed + self.speed / self.accel }
     }
 
-    /// Advances by `dt` seconds of path time and returns the position along the path.
+    /// Advances by `dt` seconds and returns the position along the path.
     pub fn advance(&mut self, dt: f64) -> f64 {
         self.time = (self.time + dt).min(self.duration());
         self.position()
     }
 
-    /// Whether the end is reached.
+    /// Whether the end has been reached.
     pub fn is_done(&self) -> bool {
         self.time >= self.duration()
     }
 
-    /// Fraction of the move's length that is done, 0 to 1.
+    /// Completed fraction of the length, 0 to 1.
     pub fn fraction(&self) -> f64 {
         if self.length <= 0.0 { 1.0 } else { (self.position() / self.length).clamp(0.0, 1.0) }
     }
@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn a_move_of_no_length_is_done_at_once() {
+    fn a_move_of_zero_length_is_done_immediately() {
         assert!(Profile::new(0.0, 1.0, 1.0, 0.0).is_done());
     }
 }

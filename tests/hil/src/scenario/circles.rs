@@ -1,14 +1,14 @@
-//! Every circle of a scene, for judging what the off-line stage makes of any click.
+//! All circles of a scene, for judging the result of the off-line stage for any click.
 
 use super::Scenario;
 use crate::scene::Snapshot;
 use graspd_rt::geom::{Pose, Vec3};
 use nalgebra::Point3;
 
-/// A circle that exists in the scene, in the left camera's frame.
+/// A circle of the scene, in the frame of the left camera.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct Circle {
-    /// What it is.
+    /// Name of the feature.
     pub name: &'static str,
     /// Centre, metres.
     pub centre: [f64; 3],
@@ -19,7 +19,7 @@ pub struct Circle {
 }
 
 impl Scenario {
-    /// Every circle of the scene; the first is the rim that [`Scenario::clicks`] mean (a bare wheel's core circle).
+    /// All circles of the scene. The first is the rim that [`Scenario::clicks`] select (for a bare wheel its core circle).
     pub fn circles(&self, shot: &Snapshot) -> Vec<Circle> {
         let (pose, w) = (self.left_from_object(), &self.stage.wheel);
         let (rb, z0) = (w.bar_radius_m, w.core_z());

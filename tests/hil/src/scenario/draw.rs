@@ -1,4 +1,4 @@
-//! Draws a cell at random until it is one that a careful integrator would have built.
+//! Draws random cells until one satisfies the conditions of a careful integrator.
 
 use super::reach::{line, seen_marks, straight_path};
 use super::{Options, STANDOFF_M, Scenario, default_gripper, grasp_pose};
@@ -10,14 +10,14 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::f64::consts::{PI, TAU};
 
-/// Cells drawn before giving up; in practice a few dozen suffice.
-const TRIES: usize = 4000;
+/// Cells drawn before giving up; a few dozen suffice in practice.
+const MAX_TRIES: usize = 4000;
 
-/// No cell could be drawn.
+/// No cell satisfies the conditions.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "no reachable cell found for seed {seed} in {TRIES} tries: the options ask for a wheel, tilt or distance that the arm or the \
-     cameras cannot have; widen them"
+    "no reachable cell for seed {seed} in {MAX_TRIES} tries: the arm or the cameras cannot reach the requested wheel size, tilt \
+    or distance; widen these options"
 )]
 pub struct ScenarioError {
     /// The seed.
@@ -25,10 +25,10 @@ pub struct ScenarioError {
 }
 
 impl Scenario {
-    /// Draws a cell: the same seed and options give the same cell on every machine.
+    /// Draws a cell. Equal seeds and options give equal cells on every machine.
     pub fn from_seed(seed: u64, options: &Options) -> Result<Self, ScenarioError> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        for _ in 0..TRIES {
+        for _ in 0..MAX_TRIES {
             if let Some(s) = attempt(seed, options, &mut rng) {
                 return Ok(s);
             }
@@ -52,7 +52,7 @@ fn unit(rng: &mut impl Rng) -> Vec3 {
     Vec3::new(r * a.cos(), r * a.sin(), z)
 }
 
-/// A rotation whose z column is `z` and whose x column lies nearest to `x`.
+/// A rotation whose z column is `z` and whose x column is as close to `x` as possible.
 fn frame(z: &Vec3, x: &Vec3) -> UnitQuaternion<f64> {
     let z = z.normalize();
     let x = (x - z * z.dot(x)).try_normalize(1e-6).unwrap_or_else(|| z.cross(&Vec3::new(0.3, 0.5, 0.8)).normalize());
@@ -62,7 +62,7 @@ fn frame(z: &Vec3, x: &Vec3) -> UnitQuaternion<f64> {
 
 fn attempt(seed: u64, o: &Options, rng: &mut ChaCha8Rng) -> Option<Scenario> {
     let wheel = draw_wheel(o, rng);
-    // The valve: in front of the arm, its axis back towards the arm and up.
+    // The valve is in front of the arm; its axis points back to the arm and upwards.
     let bearing = rng.random_range(-PI..PI);
     let out = Vec3::new(bearing.cos(), bearing.sin(), 0.0);
     let place = out * rng.random_range(0.45..0.68) + Vec3::z() * rng.random_range(0.12..0.45);
@@ -71,7 +71,7 @@ fn attempt(seed: u64, o: &Options, rng: &mut ChaCha8Rng) -> Option<Scenario> {
     let normal = swing * (-out) * up.cos() + Vec3::z() * up.sin();
     let base_from_object = Pose::from_parts(Translation3::from(place), frame(&normal, &unit(rng)));
 
-    // The rig: at its distance, off the axis by the tilt, in any direction that is not under the table.
+    // The rig is at the given distance, at an angle to the axis (tilt) in any direction, but not below the table.
     let tilt = within(rng, o.tilt_deg).to_radians();
     let turn = rng.random_range(-PI..PI);
     let towards = base_from_object.rotation * Vec3::new(tilt.sin() * turn.cos(), tilt.sin() * turn.sin(), tilt.cos());
@@ -105,7 +105,7 @@ fn attempt(seed: u64, o: &Options, rng: &mut ChaCha8Rng) -> Option<Scenario> {
         given_dh,
         start: graspd_rt::arm::READY,
         true_rig,
-        given_rig: misled(o, rng, &true_rig),
+        given_rig: miscalibrated(o, rng, &true_rig),
         gripper,
         base_from_left,
         base_from_object,
@@ -138,12 +138,12 @@ fn draw_wheel(o: &Options, rng: &mut ChaCha8Rng) -> Wheel {
 
 fn draw_rig(o: &Options, rng: &mut ChaCha8Rng, target: &Vec3, towards: &Vec3) -> Option<(Pose, Rig)> {
     let jitter = |rng: &mut ChaCha8Rng, r: f64| unit(rng) * rng.random_range(0.0..r);
-    // What the cameras are pointed at: the room in front of the valve where the gripper will move.
+    // The cameras point at the space in front of the valve, where the gripper will move.
     let aim = target + towards * 0.05 + jitter(rng, 0.04);
     let middle = target + towards * o.distance_m * rng.random_range(0.95..1.05);
     let up = if towards.z.abs() > 0.95 { Vec3::x() } else { Vec3::z() };
     let roll = Rotation3::from_axis_angle(&nalgebra::Unit::new_normalize(*towards), rng.random_range(-0.12..0.12));
-    // Right of the image as seen by a camera that looks along -towards, y down.
+    // Image x axis of a camera that looks along -towards with y down.
     let across = roll * (-towards).cross(&up).try_normalize(1e-3)?;
     let pose = |rng: &mut ChaCha8Rng, side: f64| {
         let centre = middle + across * (0.5 * side * o.baseline_m) + jitter(rng, 0.01);
@@ -178,8 +178,8 @@ fn draw_rig(o: &Options, rng: &mut ChaCha8Rng, target: &Vec3, towards: &Vec3) ->
     Some((base_from_left, rig))
 }
 
-/// The rig as graspd is told: wrong by the options' errors.
-fn misled(o: &Options, rng: &mut ChaCha8Rng, truth: &Rig) -> Rig {
+/// The rig that graspd is given: the true one with the calibration errors of the options.
+fn miscalibrated(o: &Options, rng: &mut ChaCha8Rng, truth: &Rig) -> Rig {
     let mut given = *truth;
     let k = 1.0 + sign(rng) * o.focal_error;
     for c in [&mut given.left, &mut given.right] {
@@ -191,7 +191,7 @@ fn misled(o: &Options, rng: &mut ChaCha8Rng, truth: &Rig) -> Rig {
     given
 }
 
-/// The arm as it really is: every length and angle off by the options' errors, each with its own sign.
+/// The true kinematics: every length and angle differs from the nominal one by the options' error, with a random sign.
 fn perturbed(o: &Options, rng: &mut ChaCha8Rng) -> Dh {
     let mut delta = |size: f64| std::array::from_fn(|_| sign(rng) * size);
     let (mm, rad) = (o.kinematics_error_mm * 1e-3, o.kinematics_error_deg.to_radians());
@@ -207,8 +207,8 @@ fn draw_stage(
     towards: &Vec3,
 ) -> (Stage, Sensor) {
     let to_object = base_from_object.rotation.inverse();
-    // A hall's diffuse light and a lamp over the cameras' shoulder, never behind the valve. (Hard light from the side shades a painted
-    // bar so that its edges seem to move towards the lamp by more than a tenth of a pixel; nobody would set up a cell so.)
+    // Diffuse light and a lamp near the cameras, never behind the valve. Hard light from the side shades a painted bar and
+    // shifts its apparent edges by more than 0.1 px towards the lamp; cells are not set up like that.
     let mut light = to_object * (towards + unit(rng) * 0.5);
     light.z = light.z.max(0.35);
     let pipe_angle_rad = rng.random_range(0.0..PI);
@@ -247,7 +247,8 @@ fn draw_stage(
     (stage, sensor)
 }
 
-/// Start joints from which the arm can go straight to pre-grasp and grasp, marks in view all the way and the rim free at the start.
+/// Start joints from which the arm can move in straight lines to pre-grasp and grasp, with the marks visible on the whole
+/// path and the rim unobstructed at the start.
 fn draw_start(s: &Scenario, body: &Body, rng: &mut ChaCha8Rng) -> Option<Joints> {
     let flange_from_gripper = s.gripper.gripper.flange_from_gripper;
     let open = s.gripper.opening[1];
@@ -281,55 +282,57 @@ fn draw_start(s: &Scenario, body: &Body, rng: &mut ChaCha8Rng) -> Option<Joints>
         let poses: Vec<Pose> = object_poses.iter().map(|p| s.base_from_object * p).collect();
         let first = poses.first()? * flange_from_gripper.inverse();
         for q in closed_form(&s.model.dh(), &first, 0.0) {
-            let q = settled(q);
-            let Some(path) = straight_path(s.model, &s.true_dh, &flange_from_gripper, &poses, &q) else { continue };
-            // The plan may turn the gripper otherwise about the axis, since visibility is flat there: those ways must be open too.
+            let q = within_half_turn(q);
+            let Some(joints) = straight_path(s.model, &s.true_dh, &flange_from_gripper, &poses, &q) else { continue };
+            // The plan may choose another rotation about the axis, because visibility hardly depends on it: the arm must be
+            // able to follow those paths as well.
             let turned = [-0.7, -0.35, 0.35, 0.7].iter().all(|t| {
                 let turn = s.grasp_turn_rad + t;
-                let mut way = line(&start, &grasp_pose(turn, STANDOFF_M), 16);
-                way.extend(line(&grasp_pose(turn, STANDOFF_M), &grasp_pose(turn, 0.0), 5).into_iter().skip(1));
-                let way: Vec<Pose> = way.iter().map(|p| s.base_from_object * p).collect();
-                path.first()
-                    .is_some_and(|q| straight_path(s.model, &s.true_dh, &flange_from_gripper, &way, q).is_some())
+                let mut path = line(&start, &grasp_pose(turn, STANDOFF_M), 16);
+                path.extend(line(&grasp_pose(turn, STANDOFF_M), &grasp_pose(turn, 0.0), 5).into_iter().skip(1));
+                let path: Vec<Pose> = path.iter().map(|p| s.base_from_object * p).collect();
+                joints
+                    .first()
+                    .is_some_and(|q| straight_path(s.model, &s.true_dh, &flange_from_gripper, &path, q).is_some())
             });
             if turned {
-                return path.first().copied();
+                return joints.first().copied();
             }
         }
     }
     None
 }
 
-/// The same configuration with every angle within half a turn.
-fn settled(q: Joints) -> Joints {
+/// The same arm configuration with every angle within half a turn of zero.
+fn within_half_turn(q: Joints) -> Joints {
     q.map(|v| v - TAU * (v / TAU).round())
 }
 
-/// Whether neither the gripper nor the wrist hides any of the rim from either camera.
+/// Whether gripper and wrist leave the rim unobstructed in both images.
 fn rim_is_free(s: &Scenario, body: &Body, object_from_gripper: &Pose) -> bool {
     let left_from_object = s.left_from_object();
     let gripper_from_object = object_from_gripper.inverse();
     let r = s.stage.wheel.outer_radius() + 0.012;
     View::BOTH.into_iter().all(|view| {
         let centre = left_from_object.inverse() * Point3::from(s.true_rig.centre(view));
-        let eye = (gripper_from_object * centre).coords;
+        let camera = (gripper_from_object * centre).coords;
         (0..48).all(|k| {
             let a = TAU * f64::from(k) / 48.0;
             [1.0, 0.6].iter().all(|f| {
                 let p = gripper_from_object * Point3::new(f * r * a.cos(), f * r * a.sin(), 0.0);
-                !body.hides(&eye, &p.coords, s.gripper.opening[1])
+                !body.hides(&camera, &p.coords, s.gripper.opening[1])
             })
         })
     })
 }
 
-/// A click as an operator makes it: within a pixel or two of the outer edge of the painted circle (of the rim on a bare wheel), where
-/// it is free.
+/// A click of an operator: within two pixels of the outer edge of the painted circle (of the rim on a bare wheel), where it
+/// is unobstructed.
 fn draw_click(s: &Scenario, body: &Body, with_arm: bool, view: View, rng: &mut ChaCha8Rng) -> Option<Pixel> {
     let left_from_object = s.left_from_object();
     let radius = s.stage.wheel.paint_radii().map_or(s.stage.wheel.outer_radius(), |r| r[1]);
     let gripper_from_object = s.object_from_gripper(&s.start).inverse();
-    let eye_object = left_from_object.inverse() * Point3::from(s.true_rig.centre(view));
+    let camera_object = left_from_object.inverse() * Point3::from(s.true_rig.centre(view));
     for _ in 0..200 {
         let a = rng.random_range(0.0..TAU);
         let p = Point3::new(radius * a.cos(), radius * a.sin(), 0.0);
@@ -339,7 +342,7 @@ fn draw_click(s: &Scenario, body: &Body, with_arm: bool, view: View, rng: &mut C
         }
         let covered = with_arm
             && body.hides(
-                &(gripper_from_object * eye_object).coords,
+                &(gripper_from_object * camera_object).coords,
                 &(gripper_from_object * p).coords,
                 s.gripper.opening[1],
             );

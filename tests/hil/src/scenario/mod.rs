@@ -1,7 +1,8 @@
-//! One simulated cell: where everything really stands, and what graspd is told about it.
+//! A simulated cell: its ground truth, and the calibration that graspd is given.
 //!
-//! [`Scenario::from_seed`] draws a valve, a rig and a start pose at random; [`Scenario::save`] and [`Scenario::load`] keep a cell as
-//! a *world*: a folder with the files an integrator would have (`rig.toml`, `gripper.toml`) and, apart from them, the truth.
+//! [`Scenario::from_seed`] draws a valve, a rig and a start pose at random. [`Scenario::save`] and [`Scenario::load`] store a
+//! cell as a *world*: a folder with the files an integrator would have (`rig.toml`, `gripper.toml`) and, in separate files,
+//! the ground truth.
 
 mod circles;
 mod draw;
@@ -24,45 +25,45 @@ use graspd_calib::files::GripperFile;
 use graspd_rt::arm::{Dh, Joints, Model};
 use graspd_rt::geom::{Pixel, Pose, Rig};
 
-/// Distance of the pre-grasp pose in front of the grasp that scenarios are checked with, metres.
+/// Distance of the pre-grasp pose from the grasp along the valve's axis, m; drawn cells are checked with it.
 pub const STANDOFF_M: f64 = 0.12;
 
-/// A cell: the truth, and what graspd is given.
+/// A cell: ground truth, and the calibration that graspd is given.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scenario {
-    /// Seed of all that was drawn, and of the images' noise.
+    /// Seed of the cell and of the image noise.
     pub seed: u64,
-    /// The arm's model.
+    /// Arm model.
     pub model: Model,
-    /// Kinematics as the arm really is.
+    /// True kinematics of the arm.
     pub true_dh: Dh,
-    /// Kinematics as graspd is told.
+    /// Kinematics that graspd is given.
     pub given_dh: Dh,
-    /// Joints at the start, rad.
+    /// Initial joint positions, rad.
     pub start: Joints,
-    /// The cameras as they really are.
+    /// True camera rig.
     pub true_rig: Rig,
-    /// The rig as graspd is told.
+    /// Rig that graspd is given.
     pub given_rig: Rig,
-    /// The gripper, as it is and as graspd is told.
+    /// The gripper; graspd is given the true one.
     pub gripper: GripperFile,
-    /// Where the rig stands: known to the scene only.
+    /// Pose of the left camera; ground truth.
     pub base_from_left: Pose,
-    /// Where the valve stands: known to the scene only. Object frame as in product.md: origin at the circle's centre, z along the
-    /// axis towards the cameras.
+    /// Pose of the valve; ground truth. Object frame: origin at the circle's centre, z along the axis towards the cameras.
     pub base_from_object: Pose,
-    /// Turn about the valve's axis with which the path was checked: the gripper's y points to the cameras, rad.
+    /// Rotation of the grasp about the valve's axis for which the path was checked, rad; the gripper's y axis points to the
+    /// cameras.
     pub grasp_turn_rad: f64,
-    /// The fixed things and the light.
+    /// Fixed objects and light.
     pub stage: Stage,
     /// Lens and sensor.
     pub sensor: Sensor,
-    /// A pixel near the circle in each view, as an operator would click it.
+    /// A pixel near the circle in each image, as clicked by an operator.
     pub clicks: [Pixel; 2],
 }
 
 impl Scenario {
-    /// The valve in the rig's frame.
+    /// Pose of the valve in the frame of the left camera.
     pub fn left_from_object(&self) -> Pose {
         self.base_from_left.inverse() * self.base_from_object
     }
@@ -73,7 +74,7 @@ impl Scenario {
         self.base_from_object.inverse() * base_from_gripper
     }
 
-    /// The grasp the path was checked with, in the object frame; `back` metres in front of it.
+    /// Gripper pose in the object frame `back` metres in front of the grasp for which the path was checked.
     pub fn object_from_grasp(&self, back: f64) -> Pose {
         grasp_pose(self.grasp_turn_rad, back)
     }
@@ -90,19 +91,19 @@ impl Scenario {
         )
     }
 
-    /// What the cameras see with the arm at joints `q` and open jaws.
+    /// The state to render with the arm at joints `q` and the jaws open.
     pub fn snapshot(&self, q: &Joints, frame: u64) -> Snapshot {
         let pose = self.object_from_gripper(q);
         Snapshot { object_from_gripper: [Some(pose); 2], opening: self.gripper.opening[1], frame, hidden_marks: 0 }
     }
 
-    /// Compares a true gripper pose with the grasp that stands `back` metres off the circle's centre along the axis.
+    /// Compares the true gripper pose at joints `q` with the grasp `back` metres off the circle's centre along the axis.
     pub fn truth(&self, q: &Joints, back: f64) -> Truth {
         Truth::of(&self.object_from_gripper(q), back)
     }
 }
 
-/// Gripper pose in the object frame: z against the axis, turned so that its y axis stands at `turn` from the object's x.
+/// Gripper pose in the object frame: z opposite to the valve's axis, y at the angle `turn` from the object's x.
 pub(crate) fn grasp_pose(turn: f64, back: f64) -> Pose {
     use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
     let y = Vector3::new(turn.cos(), turn.sin(), 0.0);

@@ -1,27 +1,27 @@
-//! What a scenario is drawn with.
+//! Options for drawing a scenario.
 
 use graspd_rt::arm::Model;
 
-/// Choices for [`super::Scenario::from_seed`]; the default is a well-calibrated cell with nothing in the way.
+/// Options of [`super::Scenario::from_seed`]; the default is a well-calibrated cell without occlusion.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Options {
-    /// The arm.
+    /// Arm model.
     pub model: Model,
-    /// Error of each DH length of the arm graspd is told about, mm (each with its own sign).
+    /// Error of each DH length that graspd is given, mm, with a random sign each.
     pub kinematics_error_mm: f64,
-    /// Error of each DH angle, degrees (each with its own sign).
+    /// Error of each DH angle that graspd is given, degrees, with a random sign each.
     pub kinematics_error_deg: f64,
-    /// Error of both cameras' focal length in the rig graspd is given, as a part of it (one sign for the rig).
+    /// Relative error of the focal lengths in the rig that graspd is given, with one sign for both cameras.
     pub focal_error: f64,
-    /// Error of the relative rotation in the rig graspd is given, degrees, about a random axis.
+    /// Error of the relative rotation in the rig that graspd is given, degrees, about a random axis.
     pub rotation_error_deg: f64,
-    /// Part of the rim that something hides, 0 to 0.6.
+    /// Occluded fraction of the rim, 0 to 0.6.
     pub rim_occlusion: f64,
     /// Range of the wheel's core radius R, metres.
     pub core_radius_m: [f64; 2],
     /// Range of the bar's radius r, metres.
     pub bar_radius_m: [f64; 2],
-    /// Width of the painted circle on the crest, metres; 0 for a bare wheel, whose outlines are all there is.
+    /// Width of the painted circle on the crest, metres; 0 for a bare wheel, of which only the outlines are visible.
     pub paint_width_m: f64,
     /// Range of the angle between the valve's axis and the direction to the cameras, degrees.
     pub tilt_deg: [f64; 2],
@@ -35,9 +35,9 @@ pub struct Options {
     pub size: [u32; 2],
     /// Factor on the sensor's noise.
     pub noise: f64,
-    /// Bolts and holes on the wall that look like marks.
+    /// Number of bolts and holes on the wall, which resemble marks.
     pub clutter: u32,
-    /// Whether a start pose and the path from it are demanded; off for images of a valve alone, whatever its size.
+    /// Whether the cell needs a start pose and a path from it; false for images of a valve only, of any size.
     pub with_arm: bool,
 }
 

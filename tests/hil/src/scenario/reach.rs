@@ -1,25 +1,25 @@
-//! Whether an arm can go where a scenario wants it, and whether the cameras see the marks on the way.
+//! Whether the arm can follow the paths of a scenario, and whether the cameras see the marks on them.
 
 use crate::scene::Body;
 use graspd_rt::arm::{Dh, Joints, Model, inverse};
 use graspd_rt::geom::{Pose, Rig, Vec3, View};
 use nalgebra::{Matrix6, Point3};
 
-/// Smallest singular value of the gripper's Jacobian (m/s per rad/s, rotations weighed with 0.25 m) that a path may have.
-const SIGMA_MIN: f64 = 0.045;
-/// Least cosine between a mark's normal and the direction to a camera for it to count as seen.
-const COS_MIN: f64 = 0.45;
+/// Smallest allowed singular value of the gripper's Jacobian on a path, m/s per rad/s (rotations weighted by 0.25 m).
+const MIN_SIGMA: f64 = 0.045;
+/// Smallest cosine between a mark's normal and the direction to a camera at which the mark counts as seen.
+const MIN_COS: f64 = 0.45;
 
-/// What a view sees of the marks.
+/// Numbers of visible marks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Seen {
     /// Marks seen by both cameras.
     pub both: usize,
-    /// Marks seen by the worse camera.
+    /// Marks seen by the camera that sees fewer.
     pub least: usize,
 }
 
-/// Counts the marks that both cameras see well inside their images (margin in pixels).
+/// Counts the marks that the cameras see at least `margin` pixels inside their images.
 pub fn seen_marks(body: &Body, rig: &Rig, left_from_gripper: &Pose, opening: f64, margin: f64) -> Seen {
     let mut seen = [0u64; 2];
     for view in View::BOTH {
@@ -27,7 +27,7 @@ pub fn seen_marks(body: &Body, rig: &Rig, left_from_gripper: &Pose, opening: f64
         for (i, m) in body.marks.iter().enumerate() {
             let at = (left_from_gripper * Point3::from(m.position)).coords;
             let inside = rig.project(view, &at).is_some_and(|p| rig.camera(view).contains(p, margin));
-            if inside && body.mark_seen(i, &centre, opening) > COS_MIN {
+            if inside && body.mark_seen(i, &centre, opening) > MIN_COS {
                 seen[view.index()] |= 1 << i;
             }
         }
@@ -36,7 +36,7 @@ pub fn seen_marks(body: &Body, rig: &Rig, left_from_gripper: &Pose, opening: f64
     Seen { both, least: seen[0].count_ones().min(seen[1].count_ones()) as usize }
 }
 
-/// Smallest singular value of the gripper's Jacobian, rotations weighed with 0.25 m.
+/// Smallest singular value of the gripper's Jacobian, rotations weighted by 0.25 m.
 fn sigma_min(dh: &Dh, q: &Joints, flange_from_gripper: &Pose) -> f64 {
     let mut j: Matrix6<f64> = dh.body_jacobian(q, flange_from_gripper);
     for r in 3..6 {
@@ -47,8 +47,9 @@ fn sigma_min(dh: &Dh, q: &Joints, flange_from_gripper: &Pose) -> f64 {
     j.singular_values().min()
 }
 
-/// Joints along a chain of gripper poses (base frame) reached from `near`, or `None` where the arm cannot follow smoothly: out of
-/// reach, near a singularity or a joint limit, a jump between branches, or the wrist too near to the floor or the column.
+/// Joint positions along a sequence of gripper poses (base frame), starting near `near`. `None` if the arm cannot follow it
+/// smoothly: out of reach, close to a singularity or joint limit, a change of configuration, or a wrist too close to the
+/// floor or to the arm's column.
 pub fn straight_path(
     model: Model,
     dh: &Dh,
@@ -66,7 +67,7 @@ pub fn straight_path(
             return None;
         }
         let limit = |(v, r): (&f64, &graspd_rt::arm::JointRange)| *v < r.min + 0.5 || *v > r.max - 0.5;
-        if q.iter().zip(&ranges).any(limit) || sigma_min(dh, &q, flange_from_gripper) < SIGMA_MIN {
+        if q.iter().zip(&ranges).any(limit) || sigma_min(dh, &q, flange_from_gripper) < MIN_SIGMA {
             return None;
         }
         let frames = dh.frames(&q);

@@ -1,4 +1,4 @@
-//! How far the gripper really is from where it should be.
+//! True misalignment of the gripper.
 
 use graspd_rt::geom::{Pose, Vec3};
 use serde::{Deserialize, Serialize};
@@ -8,13 +8,13 @@ use serde::{Deserialize, Serialize};
 pub struct Truth {
     /// Distance between the gripper's origin and the target, mm.
     pub position_error_mm: f64,
-    /// Angle between the gripper's z axis and the valve's axis reversed, degrees.
+    /// Angle between the gripper's z axis and the reversed axis of the valve, degrees.
     pub orientation_error_deg: f64,
-    /// The gripper's origin less the target in the object frame, mm.
+    /// Gripper origin minus target in the object frame, mm.
     pub offset_mm: [f64; 3],
-    /// Distance of the gripper's origin from the valve's axis, mm: the paper's figure.
+    /// Distance of the gripper's origin from the valve's axis, mm; the figure given in the paper.
     pub axis_distance_mm: f64,
-    /// How far in front of the circle's centre the target was taken, m.
+    /// Distance of the target from the circle's centre along the axis, m.
     pub standoff_m: f64,
 }
 
@@ -24,7 +24,7 @@ impl Truth {
         let p = object_from_gripper.translation.vector;
         let d = p - Vec3::new(0.0, 0.0, standoff_m);
         let z = object_from_gripper.rotation * Vec3::z();
-        // From the sine as well: an arc cosine near 1 has no digits.
+        // atan2 instead of the arc cosine, which is ill-conditioned near 1.
         let angle = z.cross(&-Vec3::z()).norm().atan2(z.dot(&-Vec3::z()));
         Self {
             position_error_mm: d.norm() * 1e3,

@@ -1,7 +1,7 @@
-//! A cell as a folder: what an integrator has, and apart from it the truth.
+//! A cell as a folder: the integrator's files and the ground truth.
 //!
-//! `rig.toml`, `gripper.toml`, `arm.toml` (kinematics as told) and `clicks.json` are what graspd may read; `truth.toml` and
-//! `true_arm.toml` (the mock controller's kinematics) belong to the simulators.
+//! graspd may read `rig.toml`, `gripper.toml`, `arm.toml` (kinematics that it is given) and `clicks.json`. `truth.toml`,
+//! `true_rig.toml` and `true_arm.toml` (kinematics of the mock controller) are for the simulators only.
 
 use super::Scenario;
 use crate::scene::{Sensor, Stage};
@@ -12,26 +12,26 @@ use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// A world that cannot be written or read.
+/// A world cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum WorldError {
-    /// The system refused.
-    #[error("world file {path}: {reason}; give --world a folder that `graspd-scene --make-world` wrote")]
+    /// A file cannot be read or written.
+    #[error("world file {path}: {reason}; --world expects a folder written by `graspd-scene --make-world`")]
     File {
         /// The file.
         path: PathBuf,
-        /// The system's reason.
+        /// The system's error.
         reason: std::io::Error,
     },
-    /// The text is not what it should be.
+    /// A file has wrong content.
     #[error("world file {path}: {reason}")]
     Parse {
         /// The file.
         path: PathBuf,
-        /// What is wrong and where.
+        /// What is wrong.
         reason: String,
     },
-    /// The rig or the gripper file is refused.
+    /// The rig or gripper file is invalid.
     #[error(transparent)]
     Calibration(Box<FileError>),
 }
@@ -89,7 +89,7 @@ fn pose(r: &PoseRecord) -> Option<Pose> {
 }
 
 impl Scenario {
-    /// Writes the world's files into a folder (made when missing).
+    /// Writes the world's files into a folder, which is created if it is missing.
     pub fn save(&self, dir: &Path) -> Result<(), WorldError> {
         std::fs::create_dir_all(dir).map_err(|reason| WorldError::File { path: dir.to_owned(), reason })?;
         let write = |name: &str, text: String| {
@@ -120,7 +120,7 @@ impl Scenario {
         };
         let text = toml::to_string(&truth)
             .map_err(|e| WorldError::Parse { path: dir.join("truth.toml"), reason: e.to_string() })?;
-        write("truth.toml", format!("# What graspd must never read: where everything really stands.\n{text}"))
+        write("truth.toml", format!("# Ground truth of the simulators. graspd must never read this file.\n{text}"))
     }
 
     /// Reads a world.
@@ -139,13 +139,13 @@ impl Scenario {
             return Err(bad(&path, format!("`schema` is {:?}, expected {SCHEMA:?}", t.schema)));
         }
         let model = |path: &Path, name: &str| {
-            Model::from_name(name).ok_or_else(|| bad(path, format!("`model` {name:?} is not an arm this build knows")))
+            Model::from_name(name).ok_or_else(|| bad(path, format!("unknown arm `model` {name:?}")))
         };
         let finite = |key: &str, v: &[f64]| {
             v.iter()
                 .all(|x| x.is_finite())
                 .then_some(())
-                .ok_or_else(|| bad(&path, format!("`{key}` is not made of finite numbers")))
+                .ok_or_else(|| bad(&path, format!("`{key}` holds a value that is NaN or infinite")))
         };
         finite("start_rad", &t.start_rad)?;
         finite("clicks", t.clicks.as_flattened())?;
@@ -154,12 +154,14 @@ impl Scenario {
             let a: ArmFile = toml::from_str(&text).map_err(|e| bad(&path, e.to_string()))?;
             let dh = Dh { a: a.dh.a, d: a.dh.d, alpha: a.dh.alpha, theta: a.dh.theta };
             if !dh.is_finite() {
-                return Err(bad(&path, "`dh` is not made of finite numbers".to_owned()));
+                return Err(bad(&path, "`dh` holds a value that is NaN or infinite".to_owned()));
             }
             model(&path, &a.model).map(|_| dh)
         };
         let placed = |key: &str, r: &PoseRecord| {
-            pose(r).ok_or_else(|| bad(&path, format!("`{key}` is not a pose: finite metres and a unit quaternion")))
+            pose(r).ok_or_else(|| {
+                bad(&path, format!("`{key}` is not a pose: expected finite metres and a unit quaternion"))
+            })
         };
         Ok(Self {
             seed: t.seed,

@@ -1,4 +1,4 @@
-//! The gripper's body as solids with painted discs, built from the gripper file, and the arm's wrist behind it.
+//! The gripper as solids with painted discs, built from the gripper file, and the arm's wrist behind it.
 
 use super::solid::Solid;
 use graspd_calib::files::GripperFile;
@@ -6,10 +6,10 @@ use graspd_rt::geom::{Pose, Vec3};
 use graspd_rt::gripper::Mark;
 use nalgebra::Point3;
 
-/// How far a mark may float over the box face it is painted on, metres.
-const STUCK: f64 = 1.5e-3;
-/// The wrist's radius, metres: that of a tool flange of this class.
-const WRIST_RADIUS: f64 = 0.0375;
+/// Largest distance of a mark from the box face on which it is painted, m.
+const MAX_MARK_OFFSET_M: f64 = 1.5e-3;
+/// Radius of the wrist, m: that of a tool flange of this class.
+const WRIST_RADIUS_M: f64 = 0.0375;
 
 /// Solids and marks in the gripper frame.
 #[derive(Clone, Debug)]
@@ -25,7 +25,7 @@ pub struct Body {
 }
 
 impl Body {
-    /// Builds the body: each mark is painted on the box face it lies on; a mark that lies on none gets a label of its own.
+    /// Builds the body. Each mark is painted on the box face at its position; a mark without such a face gets a label.
     pub fn new(file: &GripperFile) -> Self {
         let marks: Vec<Mark> = file.gripper.marks.iter().copied().collect();
         let mark_albedo = marks.iter().map(|m| if m.dark { 0.05 } else { 0.92 }).collect();
@@ -42,12 +42,12 @@ impl Body {
                 solids.push(label(m));
                 solids.len() - 1
             });
-            // What carries dark marks is light, and the reverse.
+            // Dark marks are on a light surface, light marks on a dark one.
             solids[k].albedo = if m.dark { 0.82 } else { 0.10 };
             solids[k].marks.push(i);
         }
         let flange = file.gripper.flange_from_gripper.inverse();
-        solids.push(Solid::cylinder(&flange, WRIST_RADIUS, -0.11, -0.0005, 28, 0.5));
+        solids.push(Solid::cylinder(&flange, WRIST_RADIUS_M, -0.11, -0.0005, 28, 0.5));
         Self { solids, marks, mark_albedo, opening: file.opening }
     }
 }
@@ -55,7 +55,7 @@ impl Body {
 fn on_face(s: &Solid, m: &Mark) -> bool {
     s.faces.iter().any(|f| {
         let Some(o) = f.corners.first() else { return false };
-        if f.normal.dot(&m.normal) < 0.999 || f.normal.dot(&(m.position - o)).abs() > STUCK {
+        if f.normal.dot(&m.normal) < 0.999 || f.normal.dot(&(m.position - o)).abs() > MAX_MARK_OFFSET_M {
             return false;
         }
         let n = f.corners.len();
@@ -66,7 +66,7 @@ fn on_face(s: &Solid, m: &Mark) -> bool {
     })
 }
 
-/// +1 when the corners run anticlockwise about the normal.
+/// +1 if the corners are counter-clockwise about the normal, else -1.
 fn orientation(c: &[Vec3], n: &Vec3) -> f64 {
     match c {
         [a, b, d, ..] => (b - a).cross(&(d - b)).dot(n).signum(),
@@ -74,7 +74,7 @@ fn orientation(c: &[Vec3], n: &Vec3) -> f64 {
     }
 }
 
-/// A thin round label behind a mark that the file's boxes do not carry.
+/// A thin round label behind a mark that is on no box of the file.
 fn label(m: &Mark) -> Solid {
     let rot = nalgebra::UnitQuaternion::rotation_between(&Vec3::z(), &m.normal)
         .unwrap_or_else(|| nalgebra::UnitQuaternion::from_axis_angle(&Vec3::x_axis(), std::f64::consts::PI));
@@ -91,11 +91,11 @@ impl Body {
         })
     }
 
-    /// Whether a mark's face is turned to a camera and unobstructed: the cosine of the viewing angle, 0 when not seen.
+    /// Cosine of the viewing angle of a mark; 0 if the mark faces away from the camera or is occluded.
     pub fn mark_seen(&self, mark: usize, centre: &Vec3, opening: f64) -> f64 {
         let Some(m) = self.marks.get(mark) else { return 0.0 };
         let cos = (centre - m.position).normalize().dot(&m.normal);
-        // A hair above the face, and four points of the disc's edge.
+        // The centre and four points of the disc's edge, slightly above the face.
         let side = m.normal.cross(&Vec3::new(0.3, 0.8, 0.5)).normalize();
         let up = m.normal.cross(&side);
         let lift = m.position + m.normal * 2e-3;
@@ -104,7 +104,7 @@ impl Body {
         if free { cos.max(0.0) } else { 0.0 }
     }
 
-    /// Corners of everything, seen from another frame.
+    /// Corners of all solids, transformed by `pose`.
     pub fn corners(&self, pose: &Pose, opening: f64) -> impl Iterator<Item = Vec3> {
         let pose = *pose;
         self.solids.iter().flat_map(move |s| {

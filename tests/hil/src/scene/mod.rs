@@ -1,13 +1,12 @@
-//! What the two cameras see: a valve on a pipe, the gripper with its marks, true to the pixel.
+//! Renderer of the stereo images: a valve on a pipe, and the gripper with its marks.
 //!
-//! The fixed part is traced once per view with fine sampling; the gripper is drawn into it for every frame with exact area
-//! coverage, under the lens's distortion, hidden and hiding by depth, then blurred and exposed with noise.
+//! The fixed part is ray traced once per view with supersampling. The gripper is drawn into it for every frame with exact
+//! area coverage, lens distortion and occlusion by depth; blur and sensor noise follow.
 //!
-//! [`StereoRenderer`] makes images; [`crate::scenario`] says of what.
+//! [`StereoRenderer`] renders; [`crate::scenario`] defines the cell.
 
 mod body;
 mod layers;
-mod program;
 mod raster;
 mod sensor;
 mod solid;
@@ -16,7 +15,6 @@ mod view;
 mod wheel;
 
 pub use body::Body;
-pub use program::{Args, Fault, main_with_args};
 pub use sensor::{Noise, Sensor};
 pub use solid::{Face, Solid};
 pub use stage::{Stage, Thing};
@@ -35,21 +33,21 @@ pub struct StereoRenderer {
     noise: Noise,
 }
 
-/// What changes from pair to pair.
+/// The part of the scene that changes between pairs.
 #[derive(Clone, Copy, Debug)]
 pub struct Snapshot {
-    /// Gripper pose at each eye's capture, in the object frame; `None` leaves the gripper out.
+    /// Gripper pose in the object frame at each camera's exposure; `None` omits the gripper.
     pub object_from_gripper: [Option<Pose>; 2],
     /// Distance between the jaws, metres.
     pub opening: f64,
-    /// Number of the image: chooses the noise.
+    /// Image number; selects the noise.
     pub frame: u64,
     /// Marks that a fault hides, by bit.
     pub hidden_marks: u32,
 }
 
 impl StereoRenderer {
-    /// Renders the fixed layers of both views (on two threads; about a second).
+    /// Renders the fixed layers of both views on two threads; takes about a second.
     pub fn new(
         stage: &Stage,
         rig: &Rig,
@@ -64,7 +62,7 @@ impl StereoRenderer {
         let views = std::thread::scope(|s| {
             let right = s.spawn(|| make(View::Right));
             let left = make(View::Left);
-            // A panic in there is a bug of the renderer; render on this thread so that it surfaces here.
+            // A panic of the helper thread is a bug of the renderer; rendering here again makes it visible.
             [left, right.join().unwrap_or_else(|_| make(View::Right))]
         });
         Self { stage: stage.clone(), body: Body::new(gripper), views, noise: Noise::new(seed ^ 0x5ce9e) }
@@ -93,7 +91,7 @@ impl StereoRenderer {
         self.views[view.index()].draw(&self.stage, moving, &self.noise, frame, dst, stride);
     }
 
-    /// Draws one view into an image of its own.
+    /// Draws one view into a new image.
     pub fn image(&mut self, view: View, shot: &Snapshot) -> image::GrayImage {
         let (w, h) = self.size();
         let mut data = vec![0; w * h];

@@ -1,8 +1,8 @@
-//! Exact area coverage of polygons: what fraction of each pixel's square a shape covers.
+//! Exact area coverage of polygons: the covered fraction of each pixel's square.
 //!
-//! Each edge leaves the signed area to its right in the pixels it crosses; a running sum along the rows turns that into coverage.
-//! The result is exact up to f32 rounding, for any polygon, at a cost of its outline plus its bounding box: no sampling noise that
-//! a sub-pixel tracker would see as motion.
+//! Each edge adds the signed area to its right to the pixels that it crosses; a cumulative sum along each row turns that into
+//! coverage. The result is exact up to f32 rounding for any polygon, at the cost of its outline plus its bounding box. There
+//! is no sampling noise, which a sub-pixel tracker would see as motion.
 
 use graspd_rt::geom::Pixel;
 
@@ -30,7 +30,7 @@ impl Rect {
         self.y1 - self.y0
     }
 
-    /// Smallest rectangle that holds the points, grown by `margin` pixels and cut to an image; `None` when nothing is left.
+    /// Bounding rectangle of the points, grown by `margin` pixels and clipped to the image; `None` if it is empty.
     pub(super) fn around(
         points: impl IntoIterator<Item = Pixel>,
         margin: f64,
@@ -44,7 +44,7 @@ impl Rect {
                 hi[k] = hi[k].max(p[k]);
             }
         }
-        // A pixel's square reaches half a pixel to each side of its centre.
+        // A pixel's square extends half a pixel to each side of its centre.
         let cut = |v: f64, n: usize| v.clamp(0.0, n as f64) as usize;
         let r = Self {
             x0: cut((lo[0] + 0.5 - margin).floor(), width),
@@ -55,13 +55,13 @@ impl Rect {
         (r.x0 < r.x1 && r.y0 < r.y1).then_some(r)
     }
 
-    /// Smallest rectangle that holds both.
+    /// Bounding rectangle of both.
     pub(super) fn union(&self, o: &Self) -> Self {
         Self { x0: self.x0.min(o.x0), y0: self.y0.min(o.y0), x1: self.x1.max(o.x1), y1: self.y1.max(o.y1) }
     }
 }
 
-/// Work memory for one polygon at a time; keeps its allocation.
+/// Rasterises one polygon at a time; keeps its buffers.
 #[derive(Debug, Default)]
 pub(super) struct Coverage {
     rect: Option<Rect>,
@@ -71,7 +71,8 @@ pub(super) struct Coverage {
 }
 
 impl Coverage {
-    /// Computes the coverage of a closed polygon (either orientation) inside `bounds`; the rectangle it touches, if any.
+    /// Computes the coverage of a closed polygon (either orientation) inside `bounds`. Returns its bounding rectangle, `None`
+    /// if it is outside.
     pub(super) fn fill(&mut self, polygon: &[Pixel], bounds: Rect) -> Option<Rect> {
         self.rect = None;
         let outer = Rect::around(polygon.iter().copied(), 0.0, bounds.x1, bounds.y1)?;
@@ -107,7 +108,7 @@ impl Coverage {
         Some(r)
     }
 
-    /// Coverage of row `y` of the image inside the rectangle of the last [`Self::fill`].
+    /// Coverage of image row `y` inside the rectangle of the last [`Self::fill`].
     pub(super) fn row(&self, y: usize) -> &[f32] {
         match self.rect {
             Some(r) if (r.y0..r.y1).contains(&y) => {
@@ -118,7 +119,7 @@ impl Coverage {
         }
     }
 
-    /// Sutherland and Hodgman against the four sides; edges along the border add no area to the inside.
+    /// Sutherland-Hodgman clipping at the four sides; edges along the border add no area to the inside.
     fn clip_to(&mut self, w: f32, h: f32) {
         for (axis, limit, keep_less) in [(0, 0.0, false), (0, w, true), (1, 0.0, false), (1, h, true)] {
             let [src, dst] = &mut self.clip;
@@ -140,7 +141,7 @@ impl Coverage {
         }
     }
 
-    /// Leaves one edge's signed areas.
+    /// Accumulates the signed areas of one edge.
     fn edge(&mut self, a: [f32; 2], b: [f32; 2], h: usize) {
         if a[1] == b[1] {
             return;
@@ -209,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn areas_of_discs_are_exact_and_their_centroids_those_of_square_pixels() {
+    fn disc_areas_are_exact_and_centroids_are_those_of_square_pixels() {
         let mut c = Coverage::default();
         for k in 0..60 {
             let (cx, cy, r) = (18.0 + 0.13 * f64::from(k), 14.0 + 0.07 * f64::from(k), 3.0 + 0.1 * f64::from(k));
@@ -227,13 +228,13 @@ mod tests {
             let exact = 0.5 * f64::from(n) * r * r * (std::f64::consts::TAU / f64::from(n)).sin();
             let (a, u, v) = sum(&c, rect);
             assert!((a - exact).abs() < 2e-3, "{a} {exact}");
-            // Pixels of a border count at their centres: a real sensor's centroid is off by as much.
+            // Border pixels count at their centres; a real sensor has the same centroid error.
             assert!((u - cx).abs() < 7e-3 && (v - cy).abs() < 7e-3, "{u} {cx} {v} {cy}");
         }
     }
 
     #[test]
-    fn a_square_on_pixel_borders_covers_whole_pixels_and_leaves_the_rest() {
+    fn a_square_aligned_with_pixel_borders_covers_only_whole_pixels() {
         let mut c = Coverage::default();
         let p = [(4.5, 2.5), (7.5, 2.5), (7.5, 5.5), (4.5, 5.5)].map(|(x, y)| Pixel::new(x, y));
         let r = c.fill(&p, ALL).unwrap();
@@ -242,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_outside_are_cut_off() {
+    fn parts_outside_the_bounds_are_clipped() {
         let mut c = Coverage::default();
         let p = [(-20.0, -10.0), (9.5, -10.0), (9.5, 100.0), (-20.0, 100.0)].map(|(x, y)| Pixel::new(x, y));
         let r = c.fill(&p, ALL).unwrap();

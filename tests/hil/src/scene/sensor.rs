@@ -1,4 +1,4 @@
-//! The camera behind the lens: point spread, vignetting, noise, quantisation.
+//! The image sensor: point spread, vignetting, noise, quantisation.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -13,7 +13,7 @@ pub struct Sensor {
     pub blur_px: f64,
     /// Loss of light in the image's corner, 0 to 1.
     pub vignetting: f64,
-    /// Noise that does not depend on light, grey values.
+    /// Noise that is independent of the light, grey values.
     pub read_noise: f64,
     /// Variance of the photon noise per grey value.
     pub shot_noise: f64,
@@ -27,11 +27,12 @@ impl Default for Sensor {
 
 /// Grey values are kept as 64ths between rendering and the sensor.
 pub(super) const SCALE: f32 = 64.0;
-/// Noise amplitudes and the noise table are both 2048ths, so that their product's upper 16 bits are 64ths of a grey value.
+/// Noise amplitudes and the noise table are both in 2048ths: the upper 16 bits of their product are 64ths of a grey value.
 const UNIT: f32 = 2048.0;
-const TABLE: usize = 1 << 18;
+/// Entries of the noise table.
+const TABLE_LENGTH: usize = 1 << 18;
 
-/// Unit normal numbers drawn once; an image reads them from a fresh place for every row.
+/// Standard normal numbers drawn once; every row of an image reads them from a different offset.
 #[derive(Debug)]
 pub struct Noise {
     table: Vec<i16>,
@@ -41,7 +42,7 @@ impl Noise {
     /// Draws the table.
     pub fn new(seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let table = (0..TABLE)
+        let table = (0..TABLE_LENGTH)
             .map(|_| {
                 let x: f32 = rng.sample(StandardNormal);
                 (x * UNIT).clamp(-15.0 * UNIT, 15.0 * UNIT) as i16
@@ -50,7 +51,7 @@ impl Noise {
         Self { table }
     }
 
-    /// The numbers for one row of `n` pixels; another place for every `key`.
+    /// The numbers for one row of `n` pixels; each `key` selects another offset.
     pub(super) fn row(&self, key: u64, n: usize) -> &[i16] {
         let k = (key ^ (key >> 31)).wrapping_mul(0x9e37_79b9_7f4a_7c15);
         let k = (k ^ (k >> 29)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -67,12 +68,12 @@ impl Sensor {
         (v.sqrt() as f32 * UNIT).min(32_000.0) as i16
     }
 
-    /// Share of light that arrives at a place, by its squared distance from the centre over that of the corner.
+    /// Relative illumination for a squared distance from the image centre, relative to that of the corner.
     pub(super) fn falloff(&self, r2: f64) -> f32 {
         (1.0 - self.vignetting * r2) as f32
     }
 
-    /// Half of the blur's symmetric kernel, centre first.
+    /// Half of the symmetric blur kernel, centre first.
     pub(super) fn kernel(&self) -> Vec<f32> {
         if self.blur_px < 0.05 {
             return vec![1.0];
@@ -85,7 +86,7 @@ impl Sensor {
     }
 }
 
-/// Adds noise to a row of 64ths and rounds to bytes.
+/// Adds noise to a row in 64ths of a grey value and rounds to bytes.
 #[inline]
 pub(super) fn expose(dst: &mut [u8], value: &[i16], amplitude: &[i16], noise: &[i16]) {
     for (((d, v), a), n) in dst.iter_mut().zip(value).zip(amplitude).zip(noise) {

@@ -1,4 +1,4 @@
-//! Convex solids: what gripper and wrist are made of, how they project, and which hides which.
+//! Convex solids of gripper and wrist: geometry, projection and painting order.
 
 use graspd_calib::files::OrientedBox;
 use graspd_rt::geom::{Camera, Pixel, Pose, Vec3};
@@ -13,16 +13,16 @@ pub struct Face {
     pub normal: Vec3,
 }
 
-/// A convex solid in the gripper frame with a diffuse grey.
+/// A convex solid in the gripper frame with a diffuse surface.
 #[derive(Clone, Debug)]
 pub struct Solid {
     /// Faces.
     pub faces: Vec<Face>,
-    /// Fraction of light given back, 0 to 1.
+    /// Albedo, 0 to 1.
     pub albedo: f64,
-    /// Discs painted on it: indices into the gripper's marks.
+    /// Marks painted on it: indices into the gripper's marks.
     pub marks: Vec<usize>,
-    /// +1 or -1 when it slides along x with the jaws (by half the opening), else 0.
+    /// +1 or -1 if it slides along x with the jaws (by half the opening), else 0.
     pub slide: f64,
 }
 
@@ -50,7 +50,7 @@ impl Solid {
         Self { faces, albedo, marks: Vec::new(), slide: 0.0 }
     }
 
-    /// A round bar along the z axis of `frame`, from `z0` to `z1`, as a prism of `sides` faces.
+    /// A cylinder along the z axis of `frame` from `z0` to `z1`, approximated by a prism with `sides` faces.
     pub fn cylinder(frame: &Pose, radius: f64, z0: f64, z1: f64, sides: usize, albedo: f64) -> Self {
         let at = |i: usize, z: f64| {
             let t = std::f64::consts::TAU * (i % sides) as f64 / sides as f64;
@@ -70,7 +70,7 @@ impl Solid {
         Self { faces, albedo, marks: Vec::new(), slide: 0.0 }
     }
 
-    /// The solid seen from another frame, jaws `opening` metres apart.
+    /// The solid transformed by `pose`, with the jaws `opening` metres apart.
     pub fn moved(&self, pose: &Pose, opening: f64) -> Self {
         let shift = Vec3::new(0.5 * self.slide * opening, 0.0, 0.0);
         let faces = self
@@ -94,13 +94,14 @@ impl Solid {
         sum / n
     }
 
-    /// Smallest signed distance of the solid's corners in front of another's face plane: positive when the plane separates them.
+    /// Smallest signed distance of the solid's corners from the plane of another solid's face: positive if the plane separates
+    /// them.
     fn beyond(&self, face: &Face) -> f64 {
         let Some(o) = face.corners.first() else { return f64::INFINITY };
         self.faces.iter().flat_map(|f| &f.corners).map(|p| face.normal.dot(&(p - o))).fold(f64::INFINITY, f64::min)
     }
 
-    /// Where the segment from `a` to `b` enters the solid, as a fraction; `None` when it misses.
+    /// Fraction of the segment from `a` to `b` at which it enters the solid; `None` if it misses.
     pub fn enter(&self, a: &Vec3, b: &Vec3) -> Option<f64> {
         let d = b - a;
         let (mut t0, mut t1) = (0.0f64, 1.0f64);
@@ -124,10 +125,10 @@ impl Solid {
     }
 }
 
-/// Order in which disjoint convex solids (camera frame, camera at the origin) must be painted, far to near.
+/// Painting order, far to near, of disjoint convex solids (camera frame, camera at the origin).
 ///
-/// Of two solids the one on the camera's side of a separating face plane can hide the other and is painted later; solids that no
-/// face plane separates are ordered by distance.
+/// Of two solids, the one on the camera's side of a separating face plane can occlude the other and is painted later. Solids
+/// without a separating face plane are ordered by distance.
 pub(super) fn paint_order(solids: &[Solid]) -> Vec<usize> {
     let n = solids.len();
     // before[i][j]: i must be painted before j.
@@ -135,7 +136,7 @@ pub(super) fn paint_order(solids: &[Solid]) -> Vec<usize> {
     for i in 0..n {
         for j in i + 1..n {
             let mut best = (1e-6, None);
-            // A face plane of `a` with all of `b` in front of it separates them; the camera's side decides.
+            // A face plane of `a` with all of `b` in front of it separates them; the side of the camera decides.
             for (a, b, flip) in [(i, j, false), (j, i, true)] {
                 for f in &solids[a].faces {
                     let gap = solids[b].beyond(f);
@@ -153,7 +154,7 @@ pub(super) fn paint_order(solids: &[Solid]) -> Vec<usize> {
     let mut order = Vec::with_capacity(n);
     while !left.is_empty() {
         let free = left.iter().position(|k| left.iter().all(|o| !before[o * n + k]));
-        // A cycle (three bars leaning on each other) has no right order: take the farthest.
+        // A cyclic overlap has no correct order: the farthest solid is painted first.
         let k = free.unwrap_or_else(|| {
             let far = |k: &usize| solids[*k].centre().norm();
             (0..left.len()).max_by(|a, b| far(&left[*a]).total_cmp(&far(&left[*b]))).unwrap_or(0)
@@ -163,9 +164,10 @@ pub(super) fn paint_order(solids: &[Solid]) -> Vec<usize> {
     order
 }
 
-/// Projects a polygon (camera frame) as the lens draws it: cut to the field of view, edges bent.
+/// Projects a polygon (camera frame) through the lens: clips it to the field of view and divides its edges into `pieces`,
+/// because distortion bends them.
 ///
-/// `out` receives the outline in pixels; empty when nothing is in front of the lens.
+/// `out` receives the outline in pixels; it is empty if nothing is in the field of view.
 pub(super) fn project(
     camera: &Camera,
     corners: &[Vec3],
@@ -174,7 +176,7 @@ pub(super) fn project(
     out: &mut Vec<Pixel>,
 ) {
     out.clear();
-    // Field of view with a margin, within which the lens model is one-to-one.
+    // Field of view with a margin within which the lens model is invertible.
     let side = |f: f64, c: f64, n: u32| 1.25 * ((f64::from(n) - c).max(c) / f) + 0.05;
     let (kx, ky) = (side(camera.fx, camera.cx, camera.width), side(camera.fy, camera.cy, camera.height));
     let planes = [
@@ -225,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn nearer_solids_are_painted_later_also_when_their_centres_lie_farther() {
+    fn nearer_solids_are_painted_later_even_if_their_centres_are_farther() {
         // A long bar whose centre is nearer than the small box in front of one of its ends.
         let bar = cube(Vec3::new(0.0, 0.0, 1.0), Vec3::new(2.0, 0.05, 0.05));
         let small = cube(Vec3::new(1.8, 0.0, 0.85), Vec3::new(0.05, 0.05, 0.05));
@@ -252,7 +254,7 @@ mod tests {
             };
             let (a, b) = (solid(1.3), solid(2.9));
             let order = paint_order(&[a.clone(), b.clone()]);
-            // Only pairs that some face plane separates have a promise.
+            // The order is defined only for pairs with a separating face plane.
             if !a.faces.iter().any(|f| b.beyond(f) > 0.0) && !b.faces.iter().any(|f| a.beyond(f) > 0.0) {
                 continue;
             }

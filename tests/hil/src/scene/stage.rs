@@ -1,4 +1,4 @@
-//! What stands still: valve, pipe, wall and light, and the grey a ray brings back from them.
+//! The fixed scene: valve, pipe, wall and light, and the grey value seen along a ray.
 
 use super::wheel::{Part, Wheel};
 use graspd_rt::geom::Vec3;
@@ -16,23 +16,23 @@ pub struct Stage {
     pub pipe_angle_rad: f64,
     /// Distance of the wall behind the origin, metres.
     pub wall_m: f64,
-    /// Bolts and holes on the wall, which look like marks: `[x, y, radius]` metres, dark ones with a positive radius.
+    /// Bolts and holes on the wall, which resemble marks: `[x, y, radius]` metres, dark ones with a positive radius.
     pub bolts_m: Vec<[f64; 3]>,
-    /// Greys: paint, rim, hub, pipe, wall (0 to 1).
+    /// Albedo of paint, rim, hub, pipe and wall, 0 to 1.
     pub albedo: [f64; 5],
     /// Unit vector towards the light.
     pub light: [f64; 3],
-    /// Share of the light that comes from everywhere.
+    /// Fraction of ambient light.
     pub ambient: f64,
-    /// Share that comes from `light`.
+    /// Fraction of directional light.
     pub diffuse: f64,
-    /// Strength of the wall's texture, as a part of its grey.
+    /// Amplitude of the wall's texture as a fraction of its grey value.
     pub texture: f64,
-    /// Grey value of a white surface that faces all the light.
+    /// Grey value of a fully lit white surface.
     pub white: f64,
 }
 
-/// What a ray met, for deciding where to sample more finely.
+/// The object that a ray hits; a change between neighbouring pixels requires supersampling.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Thing {
     /// A part of the valve.
@@ -43,7 +43,7 @@ pub enum Thing {
     Bolt,
     /// The wall.
     Wall,
-    /// Nothing.
+    /// No object.
     Void,
 }
 
@@ -52,12 +52,12 @@ impl Stage {
         Vec3::from(self.light)
     }
 
-    /// Grey value of a matt surface; `lit` is the share of direct light that arrives.
+    /// Grey value of a matt surface; `lit` is the fraction of direct light that reaches it.
     pub fn shade(&self, albedo: f64, normal: &Vec3, lit: f64) -> f64 {
         self.white * albedo * (self.ambient + self.diffuse * lit * normal.dot(&self.light()).max(0.0))
     }
 
-    /// First hit on the valve: distance, grey, what it was.
+    /// First hit on the valve: distance, grey value, part.
     pub fn valve(&self, o: &Vec3, d: &Vec3) -> Option<(f64, f64, Thing)> {
         let (t, part, mut n) = self.wheel.trace(o, d)?;
         if n.dot(d) > 0.0 {
@@ -72,7 +72,7 @@ impl Stage {
         let p = o + d * t;
         let lit = if part == Part::Cover { 1.0 } else { self.lit(&(p + n * 2e-4)) };
         let mut grey = self.shade(albedo, &n, lit);
-        // Varnish: a soft highlight.
+        // Specular highlight of the varnish.
         let half = (self.light() - d).try_normalize(0.0).unwrap_or(n);
         if part != Part::Cover {
             grey += self.white * 0.12 * lit * self.diffuse * n.dot(&half).max(0.0).powi(24);
@@ -80,7 +80,7 @@ impl Stage {
         Some((t, grey, Thing::Valve(part)))
     }
 
-    /// Grey of what lies behind the valve.
+    /// Grey value and object behind the valve.
     pub fn backdrop(&self, o: &Vec3, d: &Vec3) -> (f64, Thing) {
         if let Some((t, n)) = self.pipe(o, d) {
             let p = o + d * t;
@@ -115,7 +115,7 @@ impl Stage {
         (t > 0.0).then(|| (t, (oo + dd * t) / self.pipe_radius_m))
     }
 
-    /// Share of direct light at a point: hard shadows of valve and pipe, with a penumbra from the distance missed.
+    /// Fraction of direct light at a point: shadows of valve and pipe, with a penumbra from the distance to the occluder.
     fn lit(&self, p: &Vec3) -> f64 {
         let l = self.light();
         if self.pipe(p, &l).is_some_and(|(t, _)| t > 1e-3) {
@@ -146,7 +146,7 @@ impl Stage {
     }
 }
 
-/// A smooth random field of values -1 to 1 over the wall, stains a few centimetres wide.
+/// Texture of the wall: smooth noise from -1 to 1 with features of a few centimetres.
 fn texture(x: f64, y: f64) -> f64 {
     let octave = |x: f64, y: f64| {
         let (i, j) = (x.floor(), y.floor());

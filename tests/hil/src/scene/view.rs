@@ -1,4 +1,4 @@
-//! One camera's image: the fixed layers, the gripper drawn into them, the sensor.
+//! The image of one camera: fixed layers, gripper, sensor.
 
 use super::body::Body;
 use super::layers::{Layers, blur};
@@ -9,10 +9,10 @@ use super::stage::Stage;
 use graspd_rt::geom::{Camera, Pixel, Pose, Vec3};
 use nalgebra::Point3;
 
-/// Corners of the polygon that stands for a disc; its radius is grown so that the area is the disc's.
-const DISC: usize = 96;
+/// Corners of the polygon that approximates a disc; its radius is enlarged to match the disc's area.
+const DISC_CORNERS: usize = 96;
 
-/// Renders one view. Keeps its work memory.
+/// Renders one view; keeps its buffers.
 #[derive(Debug)]
 pub struct ViewRenderer {
     camera: Camera,
@@ -28,9 +28,9 @@ struct Work {
     coverage: Coverage,
     scratch: [Vec<Vec3>; 2],
     outline: Vec<Pixel>,
-    /// Gripper over its rectangle: grey times coverage, coverage, distance along the ray.
+    /// The gripper in its rectangle: grey value times coverage, coverage, distance along the ray.
     gripper: Vec<[f32; 3]>,
-    /// One solid at a time: grey times coverage, coverage.
+    /// One solid: grey value times coverage, coverage.
     solid: Vec<[f32; 2]>,
     image: Vec<f32>,
     blur: Vec<f32>,
@@ -42,11 +42,11 @@ struct Work {
 pub struct Moving<'a> {
     /// The gripper.
     pub body: &'a Body,
-    /// Where it is.
+    /// Its pose.
     pub object_from_gripper: Pose,
     /// Distance between the jaws, metres.
     pub opening: f64,
-    /// Marks painted over with their surroundings' grey, by bit: a fault.
+    /// Marks painted over with their surroundings, by bit (a fault).
     pub hidden_marks: u32,
 }
 
@@ -62,12 +62,12 @@ impl ViewRenderer {
         &self.camera
     }
 
-    /// Draws the image without noise nor gripper: what a long average would show.
+    /// The image without noise and gripper: the average of many exposures.
     pub fn still(&self) -> Vec<u8> {
         self.layers.exposed.0.iter().map(|v| ((v + 32) >> 6).clamp(0, 255) as u8).collect()
     }
 
-    /// Draws one image into rows of `stride` bytes. `frame` numbers the images: the same number gives the same noise.
+    /// Draws one image into rows of `stride` bytes. Equal `frame` numbers give equal noise.
     pub fn draw(
         &mut self,
         stage: &Stage,
@@ -104,14 +104,14 @@ impl ViewRenderer {
         }
     }
 
-    /// Draws the gripper over the fixed layers and blurs: the rectangle that `work.image` holds, and the part of it that is
-    /// blurred right (nearer to its border the blur lacked the neighbours).
+    /// Draws the gripper over the fixed layers and blurs. Returns the rectangle held by `work.image`, and the part of it in
+    /// which the blur is correct (at its border neighbouring pixels were missing).
     fn draw_gripper(&mut self, stage: &Stage, m: &Moving<'_>) -> Option<(Rect, Rect)> {
         let (w, h) = (self.layers.width, self.layers.height);
         let camera_from_gripper = self.camera_from_object * m.object_from_gripper;
         let n = self.kernel.len() as f64;
         let solids: Vec<Solid> = m.body.solids.iter().map(|s| s.moved(&camera_from_gripper, m.opening)).collect();
-        // The rectangle everything falls into, from the outlines as they will be drawn.
+        // Bounding rectangle of all outlines.
         let mut bounds: Option<Rect> = None;
         let work = &mut self.work;
         for f in solids.iter().flat_map(|s| &s.faces).filter(|f| faces_camera(&f.normal, &f.corners)) {
@@ -137,7 +137,7 @@ impl ViewRenderer {
                 &self.layers,
             );
         }
-        // Compose: valve over gripper where it is nearer, else gripper over valve, both over the backdrop.
+        // The nearer one of valve and gripper is composed over the other, both over the backdrop.
         work.image.clear();
         for y in region.y0..region.y1 {
             let g = &work.gripper[(y - region.y0) * rw..(y - region.y0 + 1) * rw];
@@ -169,12 +169,12 @@ impl ViewRenderer {
     }
 }
 
-/// Whether a face (camera frame) is turned to the camera at the origin.
+/// Whether a face (camera frame) faces the camera at the origin.
 fn faces_camera(normal: &Vec3, corners: &[Vec3]) -> bool {
     corners.first().is_some_and(|c| normal.dot(c) < 0.0)
 }
 
-/// Draws one convex solid with its discs over what is farther.
+/// Draws one convex solid with its marks over the farther ones.
 #[allow(clippy::too_many_arguments)]
 fn draw_solid(
     camera: &Camera,
@@ -189,7 +189,7 @@ fn draw_solid(
 ) {
     let object_rotation = camera_from_object.rotation.inverse();
     let mut touched: Option<Rect> = None;
-    // The visible faces of a convex solid share edges but no area: their coverages add up.
+    // The visible faces of a convex solid do not overlap, so their coverages add up.
     let rw = region.width();
     work.solid.clear();
     work.solid.resize(rw * region.height(), [0.0; 2]);
@@ -204,7 +204,7 @@ fn draw_solid(
             for (i, (s, c)) in work.solid[at..].iter_mut().zip(work.coverage.row(y)).enumerate() {
                 s[0] += c * grey;
                 s[1] += c;
-                // Distance along the ray where it matters: where the valve could be in front or behind.
+                // The distance along the ray is needed only where the valve could be in front or behind.
                 if *c > 0.0
                     && let Some((v, ray)) = layers.valve_at(r.x0 + i, y)
                     && v[1] > 0.0
@@ -249,22 +249,22 @@ fn draw_solid(
     }
 }
 
-/// Outline of a disc (camera frame) in pixels.
+/// Outline of a disc (camera frame) in pixels; empty if a part of it cannot be projected.
 pub(super) fn disc_outline(camera: &Camera, centre: &Vec3, normal: &Vec3, radius: f64, out: &mut Vec<Pixel>) {
     out.clear();
     let seed = if normal.x.abs() < 0.7 { Vec3::x() } else { Vec3::y() };
     let u = normal.cross(&seed).normalize();
     let v = normal.cross(&u);
-    let step = std::f64::consts::TAU / DISC as f64;
-    // Equal area: an inscribed polygon's is smaller by sin(step)/step.
+    let step = std::f64::consts::TAU / DISC_CORNERS as f64;
+    // The area of an inscribed polygon is smaller than the disc's by the factor sin(step)/step.
     let r = radius * (step / step.sin()).sqrt();
-    for k in 0..DISC {
+    for k in 0..DISC_CORNERS {
         let (s, c) = (k as f64 * step).sin_cos();
         if let Some(p) = camera.project(&(centre + (u * c + v * s) * r)) {
             out.push(p);
         }
     }
-    if out.len() < DISC {
+    if out.len() < DISC_CORNERS {
         out.clear();
     }
 }

@@ -1,7 +1,8 @@
-//! The valve: a torus with spokes, hub and stem, its crest carrying a painted circle; traced by distance.
+//! The valve: a torus with spokes, hub and stem and an optional painted circle on its crest; rendered by sphere tracing.
 //!
-//! Everything is in the object frame: z along the valve's axis towards the cameras. With a painted band the origin lies at the
-//! centre of the plane of the band's two edges, which are the circles a camera sees; without one at the centre of the bar's core circle.
+//! Everything is in the object frame, z along the valve's axis towards the cameras. With a painted band the origin is at the
+//! centre of the plane of the band's two edges, which are the circles that a camera sees. Without one it is at the centre of
+//! the bar's core circle.
 
 use graspd_rt::geom::Vec3;
 
@@ -9,7 +10,7 @@ use graspd_rt::geom::Vec3;
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Wheel {
-    /// Radius R of the circle in the middle of the bar, metres.
+    /// Radius R of the bar's core circle, metres.
     pub core_radius_m: f64,
     /// Radius r of the bar, metres.
     pub bar_radius_m: f64,
@@ -21,11 +22,11 @@ pub struct Wheel {
     pub spoke_angle_rad: f64,
     /// Length of the stem from the hub down to the pipe's axis, metres.
     pub stem_m: f64,
-    /// Part of the rim that something in front of it hides: first angle and extent, rad; extent 0 for none.
+    /// Occluded part of the rim: first angle and extent, rad; extent 0 for none.
     pub hidden_rad: [f64; 2],
 }
 
-/// What a ray met on the valve.
+/// A part of the valve.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Part {
     /// The bar of the rim.
@@ -36,22 +37,22 @@ pub enum Part {
     Spoke,
     /// Hub and stem.
     Hub,
-    /// The thing that hides part of the rim.
+    /// The sheet that occludes a part of the rim.
     Cover,
 }
 
 impl Wheel {
-    /// Half the tube angle that the paint takes, rad.
+    /// Half the tube angle covered by the paint, rad.
     fn paint_half_angle(&self) -> f64 {
         (0.5 * self.paint_width_m / self.bar_radius_m).min(1.2)
     }
 
-    /// Height of the core circle's plane in the object frame (negative: behind the origin), metres.
+    /// z of the core circle's plane in the object frame, metres; negative if it is behind the origin.
     pub fn core_z(&self) -> f64 {
         if self.paint_width_m > 0.0 { -self.bar_radius_m * self.paint_half_angle().cos() } else { 0.0 }
     }
 
-    /// Radii of the painted band's inner and outer edge, which lie in the plane z = 0, metres; `None` without paint.
+    /// Radii of the inner and outer edge of the painted band, which are in the plane z = 0, metres; `None` without paint.
     pub fn paint_radii(&self) -> Option<[f64; 2]> {
         (self.paint_width_m > 0.0).then(|| {
             let d = self.bar_radius_m * self.paint_half_angle().sin();
@@ -73,14 +74,14 @@ impl Wheel {
         (0.24 * self.core_radius_m).max(1.4 * self.bar_radius_m)
     }
 
-    /// Signed distance to the valve (a lower bound of it), metres, and the nearest part.
+    /// Lower bound of the signed distance to the valve, metres, and the nearest part.
     pub fn distance(&self, p: &Vec3) -> (f64, Part) {
         self.distance_above(p, self.core_z())
     }
 
-    /// [`Self::distance`] with the core circle's height computed once for a whole ray.
+    /// [`Self::distance`] with a precomputed `core_z`.
     pub(super) fn distance_above(&self, p: &Vec3, core_z: f64) -> (f64, Part) {
-        // Plain roots: a careful hypotenuse costs more than everything else here.
+        // A plain square root: f64::hypot would cost more than the rest of this function.
         let length = |a: f64, b: f64| (a * a + b * b).sqrt();
         let (rc, rb) = (self.core_radius_m, self.bar_radius_m);
         let z = p.z - core_z;
@@ -97,7 +98,7 @@ impl Wheel {
         };
         take(cylinder(self.hub_radius(), -1.6 * rb, 0.5 * rb), Part::Hub);
         take(cylinder(0.45 * self.hub_radius(), -self.stem_m, 0.9 * rb), Part::Hub);
-        // The angle to the nearest spoke only where a spoke could be nearer than what was found.
+        // The angle to the nearest spoke is needed only where a spoke can be nearer than `best`.
         let height = z + 0.25 * rb;
         let least = length(height, (rho - rc).max(0.0)) - self.spoke_radius();
         if self.spokes > 0 && least < best.0 {
@@ -114,7 +115,7 @@ impl Wheel {
         best
     }
 
-    /// Radius of a ball about the origin that holds the rim, hub and cover (the stem reaches further).
+    /// Radius of a sphere about the origin that contains rim, hub and cover.
     pub fn bounding_radius(&self) -> f64 {
         let cover = if self.hidden_rad[1] > 0.0 { self.core_radius_m + 3.0 * self.bar_radius_m } else { 0.0 };
         self.outer_radius().max(cover).hypot(2.2 * self.bar_radius_m).max(self.stem_m + 0.01)
@@ -151,7 +152,7 @@ impl Wheel {
         cover.map(|c| (c, Part::Cover, Vec3::new(0.0, 0.0, 1.0)))
     }
 
-    /// Whether a point of the rim carries paint.
+    /// Whether a point of the rim is painted.
     fn is_painted(&self, p: &Vec3) -> bool {
         if self.paint_width_m <= 0.0 {
             return false;
@@ -171,7 +172,7 @@ impl Wheel {
         n.try_normalize(0.0).unwrap_or_else(Vec3::z)
     }
 
-    /// A flat sheet over part of the rim, just in front of it.
+    /// Hit on the flat sheet in front of a part of the rim.
     fn trace_cover(&self, o: &Vec3, d: &Vec3) -> Option<f64> {
         let [first, extent] = self.hidden_rad;
         if extent <= 0.0 || d.z.abs() < 1e-9 {
@@ -204,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn rays_down_the_axis_meet_the_crest_at_its_height() {
+    fn rays_parallel_to_the_axis_hit_the_crest_at_its_height() {
         for paint in [0.0, 0.006] {
             let w = wheel(paint);
             for k in 0..40 {

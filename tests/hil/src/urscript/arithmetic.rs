@@ -3,17 +3,22 @@
 use super::ast::{BinaryOp, UnaryOp};
 use super::value::Value;
 
-/// Scalars that one value may hold; with the number of variables this bounds a script's memory.
+/// Scalars in one value; together with the number of variables this bounds a script's memory.
 pub(crate) const MAX_WEIGHT: usize = 20_000;
-/// Lists in lists: a matrix has 2.
+/// Nesting depth of lists; a matrix has 2.
 pub(crate) const MAX_LIST_DEPTH: usize = 4;
+
+/// Longest string of a script.
+pub(crate) const MAX_TEXT_BYTES: usize = 16_384;
+/// Rows or columns of a matrix operand: far above a Jacobian, and cheap enough for one instruction.
+pub(crate) const MAX_MATRIX: usize = 60;
 
 pub(crate) type Outcome<T = Value> = Result<T, String>;
 
-/// Refuses values too large or too deep to keep.
+/// Refuses values that are too large or nested too deeply.
 pub(crate) fn bounded(value: Value) -> Outcome {
     if value.weight() > MAX_WEIGHT {
-        return Err(format!("a value of more than {MAX_WEIGHT} elements does not fit the controller"));
+        return Err(format!("a value of more than {MAX_WEIGHT} elements exceeds the controller's memory"));
     }
     if value.depth() > MAX_LIST_DEPTH {
         return Err(format!("lists nested more than {MAX_LIST_DEPTH} deep"));
@@ -30,8 +35,8 @@ pub(crate) fn unary(op: UnaryOp, v: &Value) -> Outcome {
             items.iter().map(|x| unary(op, x)).collect::<Result<_, _>>().map(Value::List)
         }
         (UnaryOp::Plus, Value::Int(_) | Value::Float(_)) => Ok(v.clone()),
-        (UnaryOp::Not, _) => Err(format!("'not' needs a boolean, this is {}", v.type_name())),
-        _ => Err(format!("a sign needs a number, this is {}", v.type_name())),
+        (UnaryOp::Not, _) => Err(format!("'not' needs a boolean, got {}", v.type_name())),
+        _ => Err(format!("a sign needs a number, got {}", v.type_name())),
     }
 }
 
@@ -43,13 +48,13 @@ pub(crate) fn binary(op: BinaryOp, a: &Value, b: &Value) -> Outcome {
         B::Lt | B::Le | B::Gt | B::Ge => compare(op, a, b),
         B::Xor => match (a, b) {
             (Value::Bool(x), Value::Bool(y)) => Ok(Value::Bool(x ^ y)),
-            _ => Err(format!("'xor' needs booleans, not {} and {}", a.type_name(), b.type_name())),
+            _ => Err(format!("'xor' needs booleans, got {} and {}", a.type_name(), b.type_name())),
         },
         B::Add | B::Sub | B::Mul | B::Div | B::Mod => calculate(op, a, b),
     }
 }
 
-/// Numbers compare by value whatever their type; other types are equal only to their like.
+/// Numbers are compared by value regardless of their type; values of other types are equal only within one type.
 fn equal(a: &Value, b: &Value) -> bool {
     match (a, b) {
         (Value::List(x), Value::List(y)) => x.len() == y.len() && x.iter().zip(y).all(|(x, y)| equal(x, y)),
@@ -93,11 +98,24 @@ fn calculate(op: BinaryOp, a: &Value, b: &Value) -> Outcome {
         (Value::Int(_) | Value::Float(_), Value::List(y)) => {
             y.iter().map(|y| calculate(op, a, y)).collect::<Result<_, _>>().map(Value::List)
         }
+        (Value::Str(x), Value::Str(y)) if op == BinaryOp::Add => concatenate(x, y),
+        (Value::Str(_), _) | (_, Value::Str(_)) if op == BinaryOp::Add => Err(format!(
+            "'+' needs two strings or two numbers, got {} and {}; convert with to_str",
+            a.type_name(),
+            b.type_name()
+        )),
         _ => Err(format!("cannot calculate with {} and {}", a.type_name(), b.type_name())),
     }
 }
 
-/// `+ - *` and `%` stay integers; `/` gives a real number, as UR's own driver scripts rely on.
+fn concatenate(x: &str, y: &str) -> Outcome {
+    if x.len() + y.len() > MAX_TEXT_BYTES {
+        return Err(format!("a string of more than {MAX_TEXT_BYTES} bytes"));
+    }
+    Ok(Value::Str(format!("{x}{y}")))
+}
+
+/// `+ - *` and `%` of integers are integers; `/` gives a real number, on which UR's own driver scripts rely.
 fn integers(op: BinaryOp, x: i32, y: i32) -> Outcome {
     if y == 0 && matches!(op, BinaryOp::Div | BinaryOp::Mod) {
         return Err("division by zero".to_owned());
@@ -128,7 +146,7 @@ fn is_matrix(rows: &[Value]) -> bool {
     matches!(rows.first(), Some(Value::List(_)))
 }
 
-/// Matrix times matrix or column.
+/// Product of a matrix and a matrix or a column vector.
 fn matrix_product(a: &[Value], b: &[Value]) -> Outcome {
     let rows: Option<Vec<Vec<f64>>> = a.iter().map(numbers).collect();
     let rows = rows.ok_or("a matrix holds numbers only")?;
@@ -146,9 +164,8 @@ fn matrix_product(a: &[Value], b: &[Value]) -> Outcome {
     let right: Option<Vec<Vec<f64>>> = b.iter().map(numbers).collect();
     let right = right.ok_or("a matrix holds numbers only")?;
     let width = right.first().map_or(0, Vec::len);
-    // 60 x 60: far above any Jacobian, and cheap within one instruction of the budget.
-    if right.iter().any(|r| r.len() != width) || width > 60 || rows.len() > 60 || right.len() > 60 {
-        return Err("matrix rows must be equally long, and at most 60".to_owned());
+    if right.iter().any(|r| r.len() != width) || width.max(rows.len()).max(right.len()) > MAX_MATRIX {
+        return Err(format!("the rows of a matrix must have equal lengths, at most {MAX_MATRIX}"));
     }
     let mut out = Vec::new();
     for row in &rows {
@@ -170,7 +187,7 @@ fn numbers(v: &Value) -> Option<Vec<f64>> {
     }
 }
 
-/// A whole number usable as an index or a register's number.
+/// The value as an integer, if it is integral.
 pub(crate) fn whole(v: &Value) -> Option<i64> {
     match v {
         Value::Int(i) => Some(i64::from(*i)),
@@ -180,14 +197,26 @@ pub(crate) fn whole(v: &Value) -> Option<i64> {
 }
 
 fn position(v: &Value, length: usize) -> Outcome<usize> {
-    let i = whole(v).ok_or_else(|| format!("an index must be a whole number, this is {} ({v})", v.type_name()))?;
+    if let Value::Str(name) = v {
+        return Err(format!("only a struct has members such as '{name}'"));
+    }
+    let i = whole(v).ok_or_else(|| format!("an index must be an integer, got {} ({v})", v.type_name()))?;
     usize::try_from(i)
         .ok()
         .filter(|i| *i < length)
-        .ok_or_else(|| format!("index {i} is out of range: {length} elements, counted from 0"))
+        .ok_or_else(|| format!("index {i} is out of range: {length} elements, the first one is 0"))
 }
 
-/// `base[path...]`.
+/// Position of a struct's member.
+fn member(members: &[(String, Value)], name: &Value) -> Outcome<usize> {
+    let Value::Str(name) = name else { return Err("a struct has members, not elements".to_owned()) };
+    members.iter().position(|(n, _)| n == name).ok_or_else(|| {
+        let names: Vec<&str> = members.iter().map(|(n, _)| n.as_str()).collect();
+        format!("the struct has no member '{name}', only {}", names.join(", "))
+    })
+}
+
+/// `base[path...]`; a string in the path names a member of a struct.
 pub(crate) fn element(base: &Value, path: &[Value]) -> Outcome {
     let Some((first, rest)) = path.split_first() else { return Ok(base.clone()) };
     match base {
@@ -198,6 +227,10 @@ pub(crate) fn element(base: &Value, path: &[Value]) -> Outcome {
         Value::Pose(p) if rest.is_empty() => {
             let i = position(first, 6)?;
             Ok(Value::Float(p.get(i).copied().unwrap_or(0.0)))
+        }
+        Value::Struct(members) => {
+            let i = member(members, first)?;
+            members.get(i).map_or_else(|| Err("no such member".to_owned()), |(_, v)| element(v, rest))
         }
         other => Err(format!("{} has no elements", other.type_name())),
     }
@@ -214,9 +247,15 @@ pub(crate) fn set_element(base: &mut Value, path: &[Value], value: Value) -> Out
             let i = position(first, items.len())?;
             items.get_mut(i).map_or_else(|| Err("index out of range".to_owned()), |v| set_element(v, rest, value))
         }
+        Value::Struct(members) => {
+            let i = member(members, first)?;
+            members.get_mut(i).map_or_else(|| Err("no such member".to_owned()), |(_, v)| set_element(v, rest, value))
+        }
         Value::Pose(p) if rest.is_empty() => {
             let i = position(first, 6)?;
-            let x = value.as_f64().ok_or_else(|| format!("a pose holds numbers, not {}", value.type_name()))?;
+            let x = value
+                .as_f64()
+                .ok_or_else(|| format!("an element of a pose must be a number, got {}", value.type_name()))?;
             if let Some(slot) = p.get_mut(i) {
                 *slot = x;
             }

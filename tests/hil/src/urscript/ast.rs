@@ -1,4 +1,4 @@
-//! The tree between parser and compiler. Its depth is bounded by the parser, so walking and dropping it recurses safely.
+//! Syntax tree. Its depth is bounded by the parser, so recursion over it is safe.
 
 use super::value::Value;
 
@@ -29,7 +29,7 @@ pub(crate) enum UnaryOp {
 pub(crate) struct Expr {
     pub(crate) kind: ExprKind,
     pub(crate) line: u32,
-    /// Height of the tree below; bounded.
+    /// Height of the tree; bounded.
     pub(crate) depth: u32,
 }
 
@@ -39,13 +39,15 @@ pub(crate) enum ExprKind {
     Name(String),
     List(Vec<Expr>),
     Pose(Vec<Expr>),
-    /// `a[i][j, k]` flattened to one path.
+    /// `a[i][j, k].member` flattened to one path; a member is a string literal.
     Index(Box<Expr>, Vec<Expr>),
     Unary(UnaryOp, Box<Expr>),
     Binary(BinaryOp, Box<Expr>, Box<Expr>),
     And(Box<Expr>, Box<Expr>),
     Or(Box<Expr>, Box<Expr>),
     Call(String, Vec<Argument>),
+    /// `base.name(arguments)`: a remote procedure call.
+    Method(Box<Expr>, String, Vec<Argument>),
     Run(String),
 }
 

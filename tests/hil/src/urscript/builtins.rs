@@ -1,71 +1,27 @@
-//! Built-in functions that reach the controller: registers, motion, kinematics, state, outputs, pendant.
+//! Built-in functions that access the controller: registers, motion, kinematics, state, outputs, pendant.
 
 use super::arithmetic::Outcome;
 use super::error::HostError;
-use super::host::{Bank, Host, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup, Target, WatchdogAction};
+use super::functions::{Support, bind, support};
+use super::host::{
+    Bank, ForceMode, Host, KinematicsQuery, Motion, MotionStatus, OutputKind, Popup, Target, WatchdogAction,
+};
 use super::pure::{boolean, finite, index, int32, number, pose, six, text};
-use super::signature::bind;
-use super::sockets::{SocketBuffers, SocketWait};
+use super::sockets::SocketBuffers;
 use super::value::Value;
-use super::{pure, sockets};
+use super::wait::{Flow, Wait};
+use super::{pure, rpc, sockets};
 
 /// Integer and float registers of either bank.
 const REGISTERS: usize = 48;
 /// Boolean registers of either bank.
 const BITS: usize = 128;
 
-/// Functions that are accepted, checked by the host and recorded, without a meaning in the interpreter.
-const SETTINGS: [&str; 25] = [
-    "force_mode",
-    "end_force_mode",
-    "force_mode_set_damping",
-    "force_mode_set_gain_scaling",
-    "zero_ftsensor",
-    "freedrive_mode",
-    "end_freedrive_mode",
-    "teach_mode",
-    "end_teach_mode",
-    "set_gravity",
-    "set_payload_cog",
-    "set_target_payload",
-    "enable_external_ft_sensor",
-    "ft_rtde_input_enable",
-    "set_tool_voltage",
-    "set_tool_communication",
-    "set_tool_output_mode",
-    "set_tool_digital_output_mode",
-    "set_standard_analog_input_domain",
-    "set_analog_outputdomain",
-    "set_tool_analog_input_domain",
-    "set_safety_mode_transition_hardness",
-    "conveyor_pulse_decode",
-    "set_conveyor_tick_count",
-    "reset_revolution_counter",
-];
-
-/// What a thread waits for.
-#[derive(Clone, Debug)]
-pub(crate) enum Wait {
-    /// Control steps left.
-    Steps(u32),
-    Motion,
-    Popup,
-    Thread(u32),
-    Socket(SocketWait),
-}
-
-/// Whether a call has a value now.
-#[derive(Clone, Debug)]
-pub(crate) enum Flow {
-    Value(Value),
-    Wait(Wait),
-}
-
 fn refused(e: HostError) -> String {
     e.to_string()
 }
 
-/// Begins a call. `free`: no other thread's motion is under way.
+/// Begins a call. `free` is false while another thread's motion is under way.
 pub(crate) fn begin(
     name: &str,
     given: Vec<Value>,
@@ -77,14 +33,14 @@ pub(crate) fn begin(
     if given.contains(&Value::None) {
         return Err(format!("an argument of '{name}' has no value"));
     }
-    if SETTINGS.contains(&name) {
-        host.setting(name, &given).map_err(refused)?;
-        return Ok(Flow::Value(Value::None));
-    }
-    let Some(bound) = bind(name, given.clone(), names) else {
-        return host.call(name, &given).map(Flow::Value).map_err(refused);
+    let Some(bound) = bind(name, given, names) else {
+        return Err(HostError::UnknownFunction(name.to_owned()).to_string());
     };
     let a = bound?;
+    if support(name) == Support::WithoutEffect {
+        host.setting(name, &a).map_err(refused)?;
+        return Ok(Flow::Value(Value::None));
+    }
     if let Some(value) = pure::call(name, &a) {
         return value.map(Flow::Value);
     }
@@ -107,7 +63,7 @@ pub(crate) fn begin(
             if seconds <= 0.0 {
                 return Ok(Flow::Value(Value::None));
             }
-            // The small share keeps 0.1 s at 2 ms from becoming 51 steps by rounding.
+            // The small margin keeps 0.1 s at 2 ms from being rounded up to 51 steps.
             Ok(Flow::Wait(Wait::Steps((seconds / host.step_time() - 1e-6).ceil().clamp(1.0, 1e9) as u32)))
         }
         "popup" => {
@@ -121,11 +77,12 @@ pub(crate) fn begin(
             host.popup(&popup);
             Ok(if popup.blocking { Flow::Wait(Wait::Popup) } else { Flow::Value(Value::None) })
         }
+        "rpc_factory" => rpc::factory(text(x)?, text(a.get(1).unwrap_or(&none))?).map(Flow::Value),
         _ => immediate(name, &a, host).map(Flow::Value),
     }
 }
 
-/// Goes on with a call that blocks, once in each control step.
+/// Continues a blocking call, once in each control step.
 pub(crate) fn resume(wait: Wait, host: &mut dyn Host, buffers: &mut SocketBuffers) -> Outcome<Flow> {
     match wait {
         Wait::Steps(n) if n > 1 => Ok(Flow::Wait(Wait::Steps(n - 1))),
@@ -136,7 +93,8 @@ pub(crate) fn resume(wait: Wait, host: &mut dyn Host, buffers: &mut SocketBuffer
         },
         Wait::Popup if host.popup_open() => Ok(Flow::Wait(Wait::Popup)),
         Wait::Socket(wait) => sockets::resume(wait, host, buffers),
-        Wait::Steps(_) | Wait::Popup | Wait::Thread(_) => Ok(Flow::Value(Value::None)),
+        Wait::Remote(call) => rpc::resume(call, host),
+        Wait::Steps(_) | Wait::Popup | Wait::Thread(_) | Wait::Interpreter => Ok(Flow::Value(Value::None)),
     }
 }
 
@@ -145,7 +103,7 @@ fn target(v: &Value) -> Outcome<Target> {
     Ok(if matches!(v, Value::Pose(_)) { Target::Pose(values) } else { Target::Joints(values) })
 }
 
-/// The motion of a motion call; `None` if `name` is none.
+/// The motion of a motion call; `None` if `name` is not one.
 fn motion(name: &str, a: &[Value], host: &dyn Host) -> Option<Outcome<Motion>> {
     let none = Value::None;
     let at = |i: usize| a.get(i).unwrap_or(&none);
@@ -177,7 +135,7 @@ fn motion(name: &str, a: &[Value], host: &dyn Host) -> Option<Outcome<Motion>> {
 fn optional_six(v: &Value) -> Outcome<Option<[f64; 6]>> {
     match v {
         Value::None => Ok(None),
-        // UR's name for "the tool that is active".
+        // UR's name of the active TCP.
         Value::Str(s) if s == "active_tcp" => Ok(None),
         other => six(other).map(Some),
     }
@@ -195,34 +153,15 @@ fn query(a: &[Value]) -> Outcome<KinematicsQuery> {
     })
 }
 
-fn immediate(name: &str, a: &[Value], host: &mut dyn Host) -> Outcome {
-    let none = Value::None;
-    let [x, y, z] = [0, 1, 2].map(|i| a.get(i).unwrap_or(&none));
-    if let Some(done) = register(name, x, y, host).or_else(|| signal(name, x, y, host)) {
-        return done;
-    }
-    let joints = |host: &dyn Host| -> Outcome<[f64; 6]> { Ok(optional_six(x)?.unwrap_or(host.view().q_actual)) };
-    Ok(match name {
-        "get_steptime" => Value::Float(host.step_time()),
-        "get_forward_kin" => {
-            let q = joints(host)?;
-            Value::Pose(host.forward_kinematics(&q, optional_six(y)?.as_ref()))
-        }
-        "get_inverse_kin" => {
-            let found = host.inverse_kinematics(&query(a)?);
-            Value::floats(&found.ok_or("get_inverse_kin: the pose cannot be reached")?)
-        }
-        "get_inverse_kin_has_solution" => Value::Bool(host.inverse_kinematics(&query(a)?).is_some()),
-        "get_jacobian" => {
-            let q = joints(host)?;
-            let rows = host.jacobian(&q, optional_six(y)?.as_ref());
-            Value::List(rows.iter().map(|r| Value::floats(r)).collect())
-        }
+/// Value of a function that returns a part of the arm's state; `None` if `name` is not one.
+fn state(name: &str, host: &dyn Host) -> Option<Value> {
+    Some(match name {
         "get_actual_tcp_pose" => Value::Pose(host.view().tcp_pose_actual),
-        "get_target_tcp_pose" => Value::Pose(host.view().tcp_pose_target),
+        "get_target_tcp_pose" | "get_target_tcp_pose_along_path" => Value::Pose(host.view().tcp_pose_target),
+        "get_target_waypoint" => Value::Pose(host.view().target_waypoint),
         "get_actual_tool_flange_pose" => Value::Pose(host.forward_kinematics(&host.view().q_actual, Some(&[0.0; 6]))),
         "get_actual_tcp_speed" => Value::Pose(host.view().tcp_speed_actual),
-        "get_target_tcp_speed" => Value::Pose(host.view().tcp_speed_target),
+        "get_target_tcp_speed" | "get_target_tcp_speed_along_path" => Value::Pose(host.view().tcp_speed_target),
         "get_actual_joint_positions" | "get_joint_positions" => Value::floats(&host.view().q_actual),
         "get_target_joint_positions" => Value::floats(&host.view().q_target),
         "get_actual_joint_speeds" => Value::floats(&host.view().qd_actual),
@@ -237,6 +176,36 @@ fn immediate(name: &str, a: &[Value], host: &mut dyn Host) -> Outcome {
         "get_target_payload" => Value::Float(host.view().payload_mass),
         "get_target_payload_cog" => Value::floats(&host.view().payload_cog),
         "is_steady" => Value::Bool(host.view().steady),
+        _ => return None,
+    })
+}
+
+fn immediate(name: &str, a: &[Value], host: &mut dyn Host) -> Outcome {
+    let none = Value::None;
+    let [x, y, z] = [0, 1, 2].map(|i| a.get(i).unwrap_or(&none));
+    if let Some(done) = register(name, x, y, host).or_else(|| signal(name, x, y, host)) {
+        return done;
+    }
+    if let Some(value) = state(name, host) {
+        return Ok(value);
+    }
+    let joints = |host: &dyn Host| -> Outcome<[f64; 6]> { Ok(optional_six(x)?.unwrap_or(host.view().q_actual)) };
+    Ok(match name {
+        "get_steptime" => Value::Float(host.step_time()),
+        "get_forward_kin" => {
+            let q = joints(host)?;
+            Value::Pose(host.forward_kinematics(&q, optional_six(y)?.as_ref()))
+        }
+        "get_inverse_kin" => {
+            let found = host.inverse_kinematics(&query(a)?);
+            Value::floats(&found.ok_or("get_inverse_kin: no solution, the pose is out of reach")?)
+        }
+        "get_inverse_kin_has_solution" => Value::Bool(host.inverse_kinematics(&query(a)?).is_some()),
+        "get_jacobian" => {
+            let q = joints(host)?;
+            let rows = host.jacobian(&q, optional_six(y)?.as_ref());
+            Value::List(rows.iter().map(|r| Value::floats(r)).collect())
+        }
         "textmsg" => {
             host.text_message(&format!("{x}{y}"));
             Value::None
@@ -254,6 +223,24 @@ fn immediate(name: &str, a: &[Value], host: &mut dyn Host) -> Outcome {
             host.set_payload(finite(x)?, None).map_err(refused)?;
             Value::None
         }
+        "set_payload_cog" => {
+            let mass = host.view().payload_mass;
+            host.set_payload(mass, Some(three(x)?)).map_err(refused)?;
+            Value::None
+        }
+        "set_target_payload" => {
+            let cog = if *y == Value::None { None } else { Some(three(y)?) };
+            host.set_payload(finite(x)?, cog).map_err(refused)?;
+            Value::None
+        }
+        "force_mode" => {
+            host.force_mode(&force_mode(a)?).map_err(refused)?;
+            Value::None
+        }
+        "end_force_mode" => {
+            host.end_force_mode();
+            Value::None
+        }
         "protective_stop" => {
             host.protective_stop();
             Value::None
@@ -268,8 +255,25 @@ fn immediate(name: &str, a: &[Value], host: &mut dyn Host) -> Outcome {
             host.set_watchdog(text(x)?, finite(y)?, action).map_err(refused)?;
             Value::None
         }
-        // Known by its arguments, answered by whoever hosts the program.
+        // Arguments are bound here; the host evaluates the function.
         _ => return host.call(name, a).map_err(refused),
+    })
+}
+
+fn force_mode(a: &[Value]) -> Outcome<ForceMode> {
+    let none = Value::None;
+    let at = |i: usize| a.get(i).unwrap_or(&none);
+    let selection = six(at(1)).map_err(|e| format!("force_mode: selection_vector: {e}"))?;
+    let frame_type = int32(at(3))?;
+    if !(1..=3).contains(&frame_type) {
+        return Err(format!("force_mode: type {frame_type} is not 1, 2 or 3"));
+    }
+    Ok(ForceMode {
+        task_frame: pose(at(0)).map_err(|e| format!("force_mode: task_frame: {e}"))?,
+        compliant: selection.map(|s| s != 0.0),
+        wrench: six(at(2)).map_err(|e| format!("force_mode: wrench: {e}"))?,
+        frame_type,
+        limits: six(at(4)).map_err(|e| format!("force_mode: limits: {e}"))?,
     })
 }
 
@@ -277,9 +281,9 @@ fn three(v: &Value) -> Outcome<[f64; 3]> {
     match v {
         Value::List(items) => match items.as_slice() {
             [x, y, z] => Ok([finite(x)?, finite(y)?, finite(z)?]),
-            _ => Err("three numbers are needed".to_owned()),
+            _ => Err("expected three numbers".to_owned()),
         },
-        _ => Err(format!("three numbers are needed, this is {}", v.type_name())),
+        _ => Err(format!("expected three numbers, got {}", v.type_name())),
     }
 }
 
@@ -287,7 +291,7 @@ fn register(name: &str, x: &Value, y: &Value, host: &mut dyn Host) -> Option<Out
     let bank = if name.starts_with("read_input_") { Bank::Input } else { Bank::Output };
     let read = name.starts_with("read_");
     let write = name.starts_with("write_output_");
-    if !(read || write) {
+    if !(read || write) || name.contains("_port_") {
         return None;
     }
     let access = |host: &mut dyn Host| -> Outcome {
@@ -344,5 +348,6 @@ fn signal(name: &str, x: &Value, y: &Value, host: &mut dyn Host) -> Option<Outco
         })
     };
     let is = ["_digital_in", "_digital_out", "_analog_in", "_analog_out"].iter().any(|e| name.ends_with(e));
+    let is = is && !(name.starts_with("get_") && name.ends_with("_analog_out"));
     is.then(|| access(host).map_err(|e| format!("{name}: {e}")))
 }

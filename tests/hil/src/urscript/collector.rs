@@ -1,36 +1,45 @@
-//! Bytes of a script port to uploads: where one program ends and the next begins.
+//! Splits the bytes of a script port into uploads.
 
-/// Bytes kept of an upload that has not ended.
-const MAX_PENDING: usize = super::lexer::MAX_SOURCE_BYTES;
+/// Largest incomplete upload.
+const MAX_PENDING_BYTES: usize = super::lexer::MAX_SOURCE_BYTES;
 
 /// One complete upload.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Upload {
-    /// Text for [`super::Machine::load`].
-    Program(String),
-    /// The bare line `stop program`, a command of the port and no URScript.
+    /// Text for [`super::Machine::load_at`].
+    Program {
+        /// The program.
+        text: String,
+        /// Line of its beginning in what the client sent, from 1.
+        first_line: u32,
+    },
+    /// The line `stop program`, a command of the port that is not URScript.
     StopProgram,
 }
 
-/// Splits what a client sends: a `def` or `sec` up to its own `end`, any other line by itself. An unfinished last line waits for
-/// its newline, as on the controller.
+/// Collects uploads: a `def` or `sec` up to its matching `end`, or any other single line. As on the controller, a line takes
+/// effect only after its newline.
 #[derive(Debug, Default)]
 pub struct Collector {
     bytes: Vec<u8>,
     program: String,
     depth: usize,
+    /// Complete lines since the beginning of the send.
+    lines: u32,
+    /// Line at which `program` begins, counted from 0.
+    begin: u32,
 }
 
 impl Collector {
-    /// Takes bytes in any portions and returns the uploads that they complete.
+    /// Takes received bytes, however they are split, and returns the uploads that they complete.
     ///
     /// # Errors
-    /// More than 1 MiB without an end: the connection should be closed.
+    /// More than 1 MiB without an end; the connection should be closed.
     pub fn push(&mut self, bytes: &[u8]) -> Result<Vec<Upload>, &'static str> {
         let mut out = Vec::new();
         for part in bytes.split_inclusive(|b| *b == b'\n') {
-            if self.bytes.len() + self.program.len() + part.len() > MAX_PENDING {
-                return Err("a program of more than 1 MiB");
+            if self.bytes.len() + self.program.len() + part.len() > MAX_PENDING_BYTES {
+                return Err("sent a program of more than 1 MiB");
             }
             self.bytes.extend_from_slice(part);
             if part.ends_with(b"\n") {
@@ -41,11 +50,22 @@ impl Collector {
         Ok(out)
     }
 
+    /// Restarts the line numbers: the client has paused, so that the next bytes are another text.
+    pub fn begin_send(&mut self) {
+        if self.depth == 0 && self.bytes.is_empty() && self.program.trim().is_empty() {
+            self.lines = 0;
+        }
+    }
+
     fn line(&mut self, line: &str) -> Option<Upload> {
+        if self.program.is_empty() {
+            self.begin = self.lines;
+        }
+        self.lines = self.lines.saturating_add(1);
         let words = words(line);
         if self.depth == 0 {
             match words.as_slice() {
-                // Comments ahead of a program keep their place so that line numbers stay those of the client.
+                // Comments before a program are kept, so that line numbers match the client's text.
                 [] => {
                     if !line.trim().is_empty() || !self.program.is_empty() {
                         self.program.push_str(line);
@@ -67,7 +87,10 @@ impl Collector {
                 _ => {}
             }
         }
-        (self.depth == 0).then(|| Upload::Program(std::mem::take(&mut self.program)))
+        (self.depth == 0).then(|| Upload::Program {
+            text: std::mem::take(&mut self.program),
+            first_line: self.begin.saturating_add(1),
+        })
     }
 }
 
@@ -106,11 +129,13 @@ mod tests {
     const TEXT: &str = "# head\ndef a():\n  if True: # end\n    textmsg(\"end\")\n  end\nend\nset_digital_out(1, True)\nstop program\nsec b():\n x = 1\nend\n";
 
     #[test]
-    fn programs_are_split_at_their_own_end_whatever_the_portions() {
+    fn programs_end_at_their_matching_end_however_the_bytes_are_split() {
         let whole = Collector::default().push(TEXT.as_bytes()).unwrap();
         assert_eq!(whole.len(), 4);
-        assert!(matches!(&whole[0], Upload::Program(p) if p.starts_with("# head\ndef a") && p.ends_with("end\nend\n")));
-        assert_eq!(whole[1], Upload::Program("set_digital_out(1, True)\n".into()));
+        assert!(
+            matches!(&whole[0], Upload::Program { text, first_line: 1 } if text.starts_with("# head\ndef a") && text.ends_with("end\nend\n"))
+        );
+        assert_eq!(whole[1], Upload::Program { text: "set_digital_out(1, True)\n".into(), first_line: 7 });
         assert_eq!(whole[2], Upload::StopProgram);
         for portion in [1, 2, 3, 7, 50] {
             let mut c = Collector::default();
@@ -120,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unfinished_last_line_does_not_start() {
+    fn a_line_without_newline_does_not_complete_an_upload() {
         let mut c = Collector::default();
         assert_eq!(c.push(b"def a():\nend").unwrap(), []);
         assert_eq!(c.push(b"\n").unwrap().len(), 1);

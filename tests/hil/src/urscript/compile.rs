@@ -1,9 +1,10 @@
-//! Tree to a stack machine's code: an explicit stack lets a script block in the middle of nested calls.
+//! Compiler from the syntax tree to code of a stack machine. The explicit stack lets a script block within nested calls.
 
-use super::ast::{BinaryOp, Expr, ExprKind, Function, FunctionKind, Scope, Stmt, StmtKind, UnaryOp};
+use super::ast::{Argument, BinaryOp, Expr, ExprKind, Function, FunctionKind, Scope, Stmt, StmtKind, UnaryOp};
 use super::error::ScriptError;
+use super::functions::{Support, support};
 use super::value::Value;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 /// Index into [`Program::names`].
 pub(crate) type NameId = usize;
@@ -13,24 +14,30 @@ pub(crate) enum Op {
     Push(Value),
     Load(NameId),
     Store(Scope, NameId),
-    /// Value on top, then `n` indices below it.
+    /// Operands: the value on top, `n` indices below it.
     StoreIndex(NameId, usize),
     MakeList(usize),
     MakePose,
+    /// Names of the members, whose values are on the stack.
+    MakeStruct(Vec<String>),
     Index(usize),
     Unary(UnaryOp),
     Binary(BinaryOp),
     Jump(usize),
     JumpIfFalse(usize),
-    /// For `and` and `or`: jumps with the value kept if it equals the flag, else drops it.
+    /// For `and` and `or`: if the top equals the flag, keeps it and jumps; otherwise drops it.
     ShortCircuit(bool, usize),
-    /// Fails unless the top is a boolean (right side of `and` and `or`).
+    /// Fails unless the top is a boolean (right operand of `and` and `or`).
     CheckBool,
-    /// For default arguments: skip if the parameter was given.
+    /// For default arguments: jumps if the parameter was given.
     JumpIfSet(NameId, usize),
-    /// Callee and names of the arguments.
+    /// Callee, and the names of named arguments.
     CallUser(usize, Vec<Option<NameId>>),
     CallBuiltin(String, Vec<Option<String>>),
+    /// Method name and number of arguments, which are above the value.
+    CallMethod(String, usize),
+    /// The same for an element of a variable: variable, number of indices (below the arguments), method, arguments.
+    CallVariableMethod(NameId, usize, String, usize),
     Run(usize),
     Kill,
     Join,
@@ -50,18 +57,23 @@ pub(crate) struct Routine {
     pub(crate) code: Vec<Op>,
     /// Line of each operation.
     pub(crate) lines: Vec<u32>,
+    /// Whether its variables are global.
+    pub(crate) top_level: bool,
     kind: Option<FunctionKind>,
     parent: Option<usize>,
     children: HashMap<String, usize>,
 }
 
-/// A compiled upload; routine 0 is the text's first level.
+/// A compiled upload; routine 0 is the top level of the text.
 #[derive(Debug)]
 pub(crate) struct Program {
     pub(crate) routines: Vec<Routine>,
     pub(crate) names: Vec<String>,
     pub(crate) entry: usize,
     pub(crate) kind: Option<FunctionKind>,
+    assigned: HashSet<NameId>,
+    /// Routine whose functions are visible to the next statement of interpreter mode.
+    scope: usize,
 }
 
 #[derive(Default)]
@@ -69,6 +81,12 @@ struct Compiler {
     routines: Vec<Routine>,
     names: Vec<String>,
     ids: HashMap<String, NameId>,
+    /// Variables that are assigned somewhere, parameters included.
+    assigned: HashSet<NameId>,
+    /// Variables that are read, with their lines.
+    reads: Vec<(NameId, u32)>,
+    /// Functions that are called and neither defined nor built in, with their lines and the reason.
+    missing: Vec<(String, u32, Support)>,
 }
 
 struct Loop {
@@ -76,11 +94,38 @@ struct Loop {
     breaks: Vec<usize>,
 }
 
+/// Compiles a statement of interpreter mode, which sees the program's global variables and functions. Returns its routine.
+pub(crate) fn extend(program: &mut Program, text: &[Stmt]) -> Result<usize, ScriptError> {
+    let id = program.routines.len();
+    let mut c = Compiler {
+        routines: std::mem::take(&mut program.routines),
+        ids: program.names.iter().enumerate().map(|(i, n)| (n.clone(), i)).collect(),
+        names: std::mem::take(&mut program.names),
+        assigned: program.assigned.clone(),
+        ..Compiler::default()
+    };
+    c.routines.push(Routine {
+        name: "statement".to_owned(),
+        top_level: true,
+        parent: Some(program.scope),
+        ..Routine::default()
+    });
+    let result = c.body(id, text).and_then(|()| c.check_names());
+    if result.is_err() {
+        c.routines.truncate(id);
+    } else {
+        (program.assigned, program.scope) = (c.assigned, id);
+    }
+    (program.routines, program.names) = (c.routines, c.names);
+    result.map(|()| id)
+}
+
 /// Compiles an upload: one `def` or `sec`, or bare statements.
 pub(crate) fn compile(text: &[Stmt]) -> Result<Program, ScriptError> {
     let mut c = Compiler::default();
     c.routines.push(Routine { name: "bare lines".to_owned(), ..Routine::default() });
     c.body(0, text)?;
+    c.check_names()?;
     let functions: Vec<&Function> =
         text.iter().filter_map(|s| if let StmtKind::Def(f) = &s.kind { Some(f) } else { None }).collect();
     let (entry, kind) = match functions.as_slice() {
@@ -93,10 +138,13 @@ pub(crate) fn compile(text: &[Stmt]) -> Result<Program, ScriptError> {
             }
             (c.routines.first().and_then(|r| r.children.get(&only.name)).copied().unwrap_or(0), Some(only.kind))
         }
-        _ if text.is_empty() => return Err(ScriptError::new(1, "there is no statement in this program")),
+        _ if text.is_empty() => return Err(ScriptError::new(1, "the program has no statement")),
         _ => (0, None),
     };
-    Ok(Program { routines: c.routines, names: c.names, entry, kind })
+    if let Some(r) = c.routines.get_mut(entry) {
+        r.top_level = true;
+    }
+    Ok(Program { routines: c.routines, names: c.names, entry, kind, assigned: c.assigned, scope: entry })
 }
 
 impl Compiler {
@@ -139,7 +187,7 @@ impl Compiler {
         None
     }
 
-    /// Functions of a body are visible in all of it, also in the blocks within; so they are declared before code is made.
+    /// Declares the functions of a body before code is generated, because they are visible in the whole body.
     fn declare<'s>(&mut self, r: usize, body: &'s [Stmt], found: &mut Vec<(usize, &'s Function)>) {
         for s in body {
             match &s.kind {
@@ -173,6 +221,7 @@ impl Compiler {
             found.iter().map(|(_, f)| f.parameters.iter().map(|p| self.name(&p.name)).collect()).collect();
         for ((id, f), names) in found.iter().zip(parameters) {
             self.routines[*id].optional = f.parameters.iter().map(|p| p.default.is_some()).collect();
+            self.assigned.extend(&names);
             self.routines[*id].parameters = names;
         }
         for (id, f) in &found {
@@ -203,13 +252,7 @@ impl Compiler {
         let line = s.line;
         match &s.kind {
             StmtKind::Def(_) => {}
-            StmtKind::Assign { scope, name, path, value } => {
-                path.iter().try_for_each(|e| self.expr(r, e))?;
-                self.expr(r, value)?;
-                let name = self.name(name);
-                let op = if path.is_empty() { Op::Store(*scope, name) } else { Op::StoreIndex(name, path.len()) };
-                self.emit(r, line, op);
-            }
+            StmtKind::Assign { scope, name, path, value } => self.assignment(r, line, (*scope, name), path, value)?,
             StmtKind::Expr(e) => {
                 self.expr(r, e)?;
                 self.emit(r, line, Op::Pop);
@@ -264,7 +307,7 @@ impl Compiler {
                 if matches!(s.kind, StmtKind::Kill(_)) {
                     self.emit(r, line, Op::Kill);
                 } else {
-                    // Every wait leaves a value, so does join.
+                    // Every wait leaves a value, including join.
                     self.emit(r, line, Op::Join);
                     self.emit(r, line, Op::Pop);
                 }
@@ -279,11 +322,47 @@ impl Compiler {
         Ok(())
     }
 
+    fn assignment(
+        &mut self,
+        r: usize,
+        line: u32,
+        (scope, name): (Scope, &str),
+        path: &[Expr],
+        value: &Expr,
+    ) -> Result<(), ScriptError> {
+        path.iter().try_for_each(|e| self.expr(r, e))?;
+        self.expr(r, value)?;
+        // `digital_out[2] = True` of manuals before software 3.0, which urx still uses.
+        let legacy = match name {
+            "digital_out" => Some("set_digital_out"),
+            "analog_out" => Some("set_analog_out"),
+            _ => None,
+        };
+        let name = self.name(name);
+        if let (Some(function), [_]) = (legacy, path)
+            && !self.assigned.contains(&name)
+        {
+            self.emit(r, line, Op::CallBuiltin(function.to_owned(), vec![None, None]));
+            self.emit(r, line, Op::Pop);
+        } else if path.is_empty() {
+            self.assigned.insert(name);
+            self.emit(r, line, Op::Store(scope, name));
+        } else {
+            self.reads.push((name, line));
+            self.emit(r, line, Op::StoreIndex(name, path.len()));
+        }
+        Ok(())
+    }
+
     fn expr(&mut self, r: usize, e: &Expr) -> Result<(), ScriptError> {
         let line = e.line;
         let op = match &e.kind {
             ExprKind::Literal(v) => Op::Push(v.clone()),
-            ExprKind::Name(n) => Op::Load(self.name(n)),
+            ExprKind::Name(n) => {
+                let name = self.name(n);
+                self.reads.push((name, line));
+                Op::Load(name)
+            }
             ExprKind::List(items) => {
                 items.iter().try_for_each(|i| self.expr(r, i))?;
                 Op::MakeList(items.len())
@@ -317,26 +396,118 @@ impl Compiler {
             }
             ExprKind::Call(name, arguments) => {
                 arguments.iter().try_for_each(|a| self.expr(r, &a.value))?;
-                match self.resolve(r, name) {
-                    Some(f) if self.routines[f].kind == Some(FunctionKind::Def) => {
-                        let names = arguments.iter().map(|a| a.name.as_ref().map(|n| self.name(n))).collect();
-                        Op::CallUser(f, names)
-                    }
-                    Some(_) => {
-                        return Err(ScriptError::new(
-                            line,
-                            format!("'{name}' is a thread: it is started by run, not called"),
-                        ));
-                    }
-                    None => Op::CallBuiltin(name.clone(), arguments.iter().map(|a| a.name.clone()).collect()),
-                }
+                self.callee(r, name, arguments, line)?
             }
+            ExprKind::Method(base, name, arguments) => self.method(r, base, name, arguments, line)?,
             ExprKind::Run(name) => match self.resolve(r, name) {
                 Some(f) if self.routines[f].kind == Some(FunctionKind::Thread) => Op::Run(f),
-                _ => return Err(ScriptError::new(line, format!("there is no thread '{name}' to run here"))),
+                _ => return Err(ScriptError::new(line, format!("run: there is no thread '{name}' in this scope"))),
             },
         };
         self.emit(r, line, op);
         Ok(())
     }
+
+    /// Emits the operands of `base.name(arguments)` and returns the operation that calls it.
+    fn method(
+        &mut self,
+        r: usize,
+        base: &Expr,
+        name: &str,
+        arguments: &[Argument],
+        line: u32,
+    ) -> Result<Op, ScriptError> {
+        if arguments.iter().any(|a| a.name.is_some()) {
+            return Err(ScriptError::new(line, format!("method '{name}' cannot have named arguments")));
+        }
+        let none = Vec::new();
+        let variable = match &base.kind {
+            ExprKind::Name(variable) => Some((variable, &none)),
+            ExprKind::Index(inner, path) => match &inner.kind {
+                ExprKind::Name(variable) => Some((variable, path)),
+                _ => None,
+            },
+            _ => None,
+        };
+        let Some((variable, path)) = variable else {
+            self.expr(r, base)?;
+            arguments.iter().try_for_each(|a| self.expr(r, &a.value))?;
+            return Ok(Op::CallMethod(name.to_owned(), arguments.len()));
+        };
+        let variable = self.name(variable);
+        self.reads.push((variable, line));
+        path.iter().try_for_each(|i| self.expr(r, i))?;
+        arguments.iter().try_for_each(|a| self.expr(r, &a.value))?;
+        Ok(Op::CallVariableMethod(variable, path.len(), name.to_owned(), arguments.len()))
+    }
+
+    /// The operation that calls function `name`, whose arguments are on the stack.
+    fn callee(&mut self, r: usize, name: &str, arguments: &[Argument], line: u32) -> Result<Op, ScriptError> {
+        match self.resolve(r, name) {
+            Some(f) if self.routines[f].kind == Some(FunctionKind::Def) => {
+                let names = arguments.iter().map(|a| a.name.as_ref().map(|n| self.name(n))).collect();
+                Ok(Op::CallUser(f, names))
+            }
+            Some(_) => Err(ScriptError::new(line, format!("'{name}' is a thread: start it with run"))),
+            None if name == "struct" => arguments
+                .iter()
+                .map(|a| a.name.clone())
+                .collect::<Option<Vec<_>>>()
+                .map(Op::MakeStruct)
+                .ok_or_else(|| ScriptError::new(line, "struct needs named members: struct(name=value, ...)")),
+            None => {
+                let support = support(name);
+                if matches!(support, Support::Unknown | Support::Refused) {
+                    self.missing.push((name.to_owned(), line, support));
+                }
+                Ok(Op::CallBuiltin(name.to_owned(), arguments.iter().map(|a| a.name.clone()).collect()))
+            }
+        }
+    }
+
+    /// Refuses a program with names that are not defined anywhere, all of them in one message.
+    fn check_names(&self) -> Result<(), ScriptError> {
+        let mut unknown: Vec<(String, Vec<u32>)> = Vec::new();
+        let mut unsupported: Vec<(String, Vec<u32>)> = Vec::new();
+        let note = |list: &mut Vec<(String, Vec<u32>)>, name: String, line: u32| match list
+            .iter_mut()
+            .find(|(n, _)| *n == name)
+        {
+            Some((_, lines)) if lines.contains(&line) => {}
+            Some((_, lines)) => lines.push(line),
+            None => list.push((name, vec![line])),
+        };
+        for (name, line, support) in &self.missing {
+            let list = if *support == Support::Refused { &mut unsupported } else { &mut unknown };
+            note(list, format!("{name}()"), *line);
+        }
+        for (id, line) in self.reads.iter().filter(|(id, _)| !self.assigned.contains(id)) {
+            note(&mut unknown, self.names.get(*id).cloned().unwrap_or_default(), *line);
+        }
+        let first = unknown.iter().chain(&unsupported).flat_map(|(_, lines)| lines).min();
+        let Some(&first) = first else { return Ok(()) };
+        let mut parts = Vec::new();
+        for (what, list) in [("unknown names", &unknown), ("functions that this mock does not simulate", &unsupported)]
+        {
+            if !list.is_empty() {
+                let names: Vec<String> =
+                    list.iter().take(MAX_NAMES).map(|(name, lines)| format!("{name} {}", place(lines))).collect();
+                let rest = list.len().saturating_sub(MAX_NAMES);
+                let more = if rest > 0 { format!(" and {rest} more") } else { String::new() };
+                parts.push(format!("{what}: {}{more}", names.join(", ")));
+            }
+        }
+        Err(ScriptError::new(first, format!("{}; nothing was started", parts.join("; "))))
+    }
+}
+
+/// Names listed in one message.
+const MAX_NAMES: usize = 50;
+/// Lines listed for one name.
+const MAX_LINES: usize = 5;
+
+fn place(lines: &[u32]) -> String {
+    let shown: Vec<String> = lines.iter().take(MAX_LINES).map(u32::to_string).collect();
+    let more = if lines.len() > MAX_LINES { ", ..." } else { "" };
+    format!("({} {}{more})", if lines.len() == 1 { "line" } else { "lines" }, shown.join(", "))
 }

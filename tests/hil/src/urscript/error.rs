@@ -1,14 +1,14 @@
-//! What can go wrong with a script: at upload, at run time, and in the host that it calls.
+//! Errors of a script: at upload, at run time, and in the host.
 
 use thiserror::Error;
 
-/// A program that is not URScript: refused at upload, nothing has run.
+/// A program that is refused at upload; nothing has run.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[error("line {line}: {message}")]
 pub struct ScriptError {
     /// Line of the uploaded text, from 1.
     pub line: u32,
-    /// What is wrong and what was expected.
+    /// What is wrong.
     pub message: String,
 }
 
@@ -18,23 +18,23 @@ impl ScriptError {
     }
 }
 
-/// A program that failed while it ran; the controller stops it and shows a runtime exception.
+/// A program that failed at run time; the controller stops it and reports a runtime exception.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[error("runtime exception in line {line}: {message}")]
 pub struct RuntimeError {
     /// Line of the uploaded text, from 1.
     pub line: u32,
-    /// What happened.
+    /// What is wrong.
     pub message: String,
 }
 
-/// A refusal by the host, which becomes a [`RuntimeError`] at the line of the call.
+/// An error of the host; it becomes a [`RuntimeError`] at the line of the call.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 pub enum HostError {
     /// The host has no function of this name.
     #[error("function '{0}' is not known to this controller")]
     UnknownFunction(String),
-    /// The function exists; this call of it cannot be carried out.
+    /// The call cannot be executed.
     #[error("{0}")]
     Refused(String),
 }

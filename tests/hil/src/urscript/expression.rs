@@ -1,4 +1,4 @@
-//! Expressions: `or`, `xor`, `and`, `not`, comparison, sum, product, sign, index, call; loosest first.
+//! Parser of expressions. Precedence, lowest first: `or`, `xor`, `and`, `not`, comparison, sum, product, sign, index and call.
 
 use super::ast::{Argument, BinaryOp, Expr, ExprKind, UnaryOp};
 use super::error::ScriptError;
@@ -6,7 +6,7 @@ use super::lexer::Token;
 use super::parser::Parser;
 use super::value::Value;
 
-/// Height of an expression's tree, chains of operators included.
+/// Height of an expression's tree; a chain of operators adds one level per operator.
 const MAX_DEPTH: u32 = 200;
 /// Elements of a literal list.
 const MAX_ELEMENTS: usize = 10_000;
@@ -137,24 +137,42 @@ impl Parser<'_> {
         node(ExprKind::Unary(op, Box::new(inner)), line, below)
     }
 
+    /// Parses elements `[...]`, members `.name` and remote calls `.name(...)` after a value.
     fn postfix(&mut self) -> Result<Expr, ScriptError> {
-        let base = self.primary()?;
-        if !self.is_symbol("[") {
-            return Ok(base);
+        let mut base = self.primary()?;
+        loop {
+            let line = base.line;
+            let mut path = Vec::new();
+            let mut method = None;
+            loop {
+                if self.take_symbol("[") {
+                    let items = self.items("]")?;
+                    if items.is_empty() {
+                        return Err(ScriptError::new(line, "an index is missing between '[' and ']'"));
+                    }
+                    path.extend(items);
+                } else if self.take_symbol(".") {
+                    let name = self.identifier("a member's name")?;
+                    if self.take_symbol("(") {
+                        method = Some((name, self.arguments()?));
+                        break;
+                    }
+                    path.push(node(ExprKind::Literal(Value::Str(name)), line, 0)?);
+                } else {
+                    break;
+                }
+            }
+            if !path.is_empty() {
+                let below = base.depth.max(deepest(&path));
+                base = node(ExprKind::Index(Box::new(base), path), line, below)?;
+            }
+            let Some((name, arguments)) = method else { return Ok(base) };
+            let below = base.depth.max(deepest(arguments.iter().map(|a| &a.value)));
+            base = node(ExprKind::Method(Box::new(base), name, arguments), line, below)?;
         }
-        let line = base.line;
-        let mut path = Vec::new();
-        while self.take_symbol("[") {
-            path.extend(self.items("]")?);
-        }
-        if path.is_empty() {
-            return Err(ScriptError::new(line, "an index is missing between '[' and ']'"));
-        }
-        let below = base.depth.max(deepest(&path));
-        node(ExprKind::Index(Box::new(base), path), line, below)
     }
 
-    /// Expressions separated by commas, and the closing bracket.
+    /// Parses expressions separated by commas, and the closing bracket.
     fn items(&mut self, close: &str) -> Result<Vec<Expr>, ScriptError> {
         let mut out = Vec::new();
         while !self.is_symbol(close) {
@@ -171,7 +189,7 @@ impl Parser<'_> {
     }
 
     fn primary(&mut self) -> Result<Expr, ScriptError> {
-        // A value that is due may stand on a later line.
+        // A value may follow on a later line.
         while matches!(self.peek(), Some(Token::Newline)) {
             self.advance();
         }
@@ -214,7 +232,7 @@ impl Parser<'_> {
                     self.expect_symbol(")")?;
                     node(ExprKind::Run(name), line, 0)
                 }
-                // `p[...]` is a pose when six numbers follow; a variable called p keeps its index.
+                // `p[...]` with six elements is a pose; with one or two it indexes a variable named p.
                 "p" if matches!(self.peek_second(), Some(Token::Symbol("["))) => {
                     self.advance();
                     self.advance();
@@ -226,7 +244,7 @@ impl Parser<'_> {
                             let name = node(ExprKind::Name("p".to_owned()), line, 0)?;
                             node(ExprKind::Index(Box::new(name), items), line, below.max(1))
                         }
-                        n => Err(ScriptError::new(line, format!("a pose has six numbers, this one {n}"))),
+                        n => Err(ScriptError::new(line, format!("a pose needs six numbers, got {n}"))),
                     }
                 }
                 _ => {

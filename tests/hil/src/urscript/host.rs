@@ -1,8 +1,8 @@
-//! The controller around a script: everything that a program can see or move outside itself.
+//! The interface between a script and the controller.
 //!
-//! A host owns the dynamics, the registers and the wires. The interpreter checks argument counts, types and finiteness before it
-//! calls; a host judges ranges and states and refuses by [`HostError`], which stops the program with the line of the call.
-//! Functions that block a script are polled: the interpreter asks again in each later control step.
+//! A host owns dynamics, registers and connections. The interpreter checks argument counts, types and finiteness before a call;
+//! the host checks ranges and states and refuses with a [`HostError`], which stops the program at the line of the call.
+//! Blocking functions are polled in each later control step.
 
 use super::error::{HostError, RuntimeError};
 use super::value::Value;
@@ -11,11 +11,11 @@ use super::value::Value;
 pub const JOINTS: usize = 6;
 /// Joint values, base to wrist 3: rad, rad/s or Nm.
 pub type JointVector = [f64; JOINTS];
-/// Position in metres and rotation vector in radians (or a twist, or a wrench), robot base frame unless said otherwise.
+/// Position in metres and rotation vector in radians (or a twist, or a wrench), robot base frame unless stated otherwise.
 pub type PoseVector = [f64; 6];
 
-/// Where a Cartesian or joint move goes. A joint target of a linear move is turned into a pose by the host's forward kinematics,
-/// a pose target of `movej` into joints by its inverse kinematics.
+/// Target of a move. The host converts a joint target of a linear move with its forward kinematics, and a pose target of
+/// `movej` with its inverse kinematics.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Target {
     /// Joint positions, rad.
@@ -24,7 +24,7 @@ pub enum Target {
     Pose(PoseVector),
 }
 
-/// A motion call with its defaults filled in; every number is finite. `t` of 0 means "not given".
+/// A motion call with its defaults filled in. All numbers are finite; `t` is 0 if it was not given.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[expect(missing_docs, reason = "the fields are UR's own argument names: a, v, t, r in SI units")]
 pub enum Motion {
@@ -34,20 +34,20 @@ pub enum Motion {
     MoveL { target: Target, a: f64, v: f64, t: f64, r: f64 },
     /// Process move: constant tool speed, circular blends.
     MoveP { target: Target, a: f64, v: f64, r: f64 },
-    /// Circle through `via` to `to`; `mode` 0 free orientation, 1 fixed.
+    /// Circle through `via` to `to`; `mode` 0: unconstrained orientation, 1: fixed.
     MoveC { via: Target, to: Target, a: f64, v: f64, r: f64, mode: i32 },
-    /// Joint servo for `t` seconds; `a` and `v` are not used by the controller.
+    /// Joint servo for `t` seconds; the controller does not use `a` and `v`.
     ServoJ { q: JointVector, a: f64, v: f64, t: f64, lookahead_time: f64, gain: f64 },
     /// Circular servo to a pose.
     ServoC { target: Target, a: f64, v: f64, r: f64 },
-    /// Joint speeds; the arm KEEPS MOVING after the call has returned, until another motion call, a stop or the program's end.
-    /// With `t` > 0 it returns after `t`, without on reaching the speed.
+    /// Joint speeds. The arm KEEPS MOVING after the call has returned, until another motion call, a stop or the end of the
+    /// program. The call returns after `t` if that is given, otherwise when the speed is reached.
     SpeedJ { qd: JointVector, a: f64, t: f64 },
-    /// Tool twist in the base frame; `a_rot` 0 means as `a`. Goes on as `SpeedJ`.
+    /// Tool twist in the base frame; `a_rot` is 0 if it equals `a`. Continues like `SpeedJ`.
     SpeedL { xd: PoseVector, a: f64, t: f64, a_rot: f64 },
     /// Decelerate to rest in joint space, rad/s^2 of the leading axis.
     StopJ { a: f64 },
-    /// Decelerate to rest in tool space, m/s^2; `a_rot` 0 means not given.
+    /// Decelerate to rest in tool space, m/s^2; `a_rot` is 0 if it was not given.
     StopL { a: f64, a_rot: f64 },
 }
 
@@ -58,7 +58,7 @@ pub enum MotionStatus {
     Running,
     /// The call returns in this step.
     Done,
-    /// The call fails (path not possible, singular, out of reach): runtime exception.
+    /// The call fails (no solution, singularity, out of reach): runtime exception.
     Failed(String),
 }
 
@@ -74,7 +74,7 @@ pub enum WatchdogAction {
     Ignore,
 }
 
-/// Which general-purpose registers are meant.
+/// Bank of general-purpose registers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Bank {
     /// `input_*_register`: written by RTDE clients and fieldbus.
@@ -83,7 +83,7 @@ pub enum Bank {
     Output,
 }
 
-/// Which digital or analog signal is meant.
+/// Group of digital or analog signals.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum OutputKind {
     /// Standard digital or analog, 0..8 or 0..2.
@@ -94,7 +94,7 @@ pub enum OutputKind {
     Tool,
 }
 
-/// What a script can ask about the arm; all of one control step.
+/// State of the arm in one control step.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct RobotView {
     /// Measured joint positions, rad.
@@ -115,6 +115,8 @@ pub struct RobotView {
     pub tcp_speed_actual: PoseVector,
     /// Target TCP twist.
     pub tcp_speed_target: PoseVector,
+    /// TCP pose at the end of the present move, or of the last one.
+    pub target_waypoint: PoseVector,
     /// Wrench at the TCP.
     pub tcp_force: PoseVector,
     /// Active TCP in the flange frame.
@@ -123,28 +125,54 @@ pub struct RobotView {
     pub payload_mass: f64,
     /// Payload's centre of gravity in the flange frame, m.
     pub payload_cog: [f64; 3],
-    /// At rest, ready for force mode: `is_steady()`.
+    /// At rest: `is_steady()`.
     pub steady: bool,
     /// Speed slider times scaling, 0 to 1.
     pub speed_fraction: f64,
 }
 
-/// A question of kinematics.
+/// Arguments of `force_mode`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ForceMode {
+    /// Force frame relative to the base frame.
+    pub task_frame: PoseVector,
+    /// Compliant axes of the force frame.
+    pub compliant: [bool; 6],
+    /// Wrench that the robot applies to its environment along the compliant axes, N and Nm.
+    pub wrench: PoseVector,
+    /// 1: y axis from the TCP towards the frame's origin; 2: as given; 3: x axis along the TCP's velocity.
+    pub frame_type: i32,
+    /// Largest speeds of compliant axes (m/s, rad/s), largest deviations of the others (m, rad).
+    pub limits: PoseVector,
+}
+
+/// Progress of a remote procedure call.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Remote {
+    /// No response yet; ask again in the next step.
+    Pending,
+    /// Body of the response.
+    Response(Vec<u8>),
+    /// The call failed, with the reason.
+    Failed(String),
+}
+
+/// A request for inverse kinematics.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KinematicsQuery {
-    /// TCP pose asked for.
+    /// Requested TCP pose.
     pub pose: PoseVector,
-    /// Solution nearest to these joints; the current target joints where `None`.
+    /// Joints to which the solution should be close; `None` for the present target joints.
     pub near: Option<JointVector>,
     /// Allowed position error, m.
     pub max_position_error: f64,
     /// Allowed orientation error, rad.
     pub max_orientation_error: f64,
-    /// TCP in the flange frame; the active one where `None`.
+    /// TCP in the flange frame; `None` for the active one.
     pub tcp: Option<PoseVector>,
 }
 
-/// A window on the pendant.
+/// A popup on the pendant.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Popup {
     /// Text.
@@ -159,41 +187,41 @@ pub struct Popup {
     pub blocking: bool,
 }
 
-/// A connection being made.
+/// Progress of a connection attempt.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Connect {
-    /// Not yet; ask again in the next step.
+    /// Not connected yet; ask again in the next step.
     Pending,
-    /// Open.
+    /// Connected.
     Open,
-    /// Refused or out of reach.
+    /// Refused or unreachable.
     Failed,
 }
 
-/// Bytes that have arrived on a socket.
+/// Bytes received on a socket.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Received {
     /// Some bytes, at least one.
     Bytes(Vec<u8>),
-    /// None at present.
+    /// No bytes at present.
     Nothing,
-    /// The peer has closed, or there is no such socket.
+    /// The peer has closed the connection, or there is no such socket.
     Closed,
 }
 
-/// What one control step of a program came to.
+/// Outcome of one control step of a program.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum StepOutcome {
-    /// Goes on in the next step.
+    /// The program continues in the next step.
     Running,
-    /// The main program has returned, or `halt` was executed. Its threads are gone.
+    /// The main program has returned or executed `halt`; its threads have ended.
     Finished,
     /// Stopped by a runtime exception.
     Failed(RuntimeError),
 }
 
-/// The controller as a script sees it. Required methods are what motion control needs; the rest has defaults that are honest
-/// about not being there.
+/// The controller as seen by a script. Required methods are those of motion control; the defaults of the others report that
+/// the feature is missing.
 pub trait Host {
     /// Control step in seconds: 0.002 (e-Series) or 0.008 (CB3).
     fn step_time(&self) -> f64;
@@ -214,48 +242,48 @@ pub trait Host {
     /// Sets an output boolean register, index 0..128.
     fn write_bool(&mut self, index: usize, value: bool);
 
-    /// Begins a motion, replacing any motion that goes on.
+    /// Begins a motion, replacing any other.
     ///
     /// # Errors
-    /// The call is refused: runtime exception at the caller's line.
+    /// The motion is refused: runtime exception at the line of the call.
     fn motion_start(&mut self, motion: &Motion) -> Result<(), HostError>;
-    /// Asked once in each later step while a thread waits for the motion it started.
+    /// Polled in each later step while a thread waits for the motion that it started.
     fn motion_poll(&mut self) -> MotionStatus;
-    /// The waiting thread was killed or the program ended with the motion under way: nobody polls it any more. Moves come to a
-    /// stop by themselves; speed motions go on until the next motion call (the host stops them when the program ends).
+    /// The waiting thread was killed, or the program ended during the motion, so it is no longer polled. Moves must come to a
+    /// stop; speed motions continue until the next motion call (the host stops them when the program ends).
     fn motion_abandon(&mut self);
 
-    /// TCP pose at joint positions `q`; `tcp` is the tool in the flange frame, the active one where `None`.
+    /// TCP pose at joint positions `q`; `tcp` is the TCP in the flange frame, `None` for the active one.
     fn forward_kinematics(&self, q: &JointVector, tcp: Option<&PoseVector>) -> PoseVector;
-    /// Joint positions for a TCP pose; `None` where there is no solution.
+    /// Joint positions for a TCP pose; `None` if there is no solution.
     fn inverse_kinematics(&self, query: &KinematicsQuery) -> Option<JointVector>;
     /// Geometric Jacobian at `q` (base frame, TCP point), rows vx vy vz wx wy wz.
     fn jacobian(&self, q: &JointVector, tcp: Option<&PoseVector>) -> [[f64; 6]; 6];
 
-    /// Text for the pendant's log (text message on the primary interface).
+    /// Writes to the pendant's log (text message on the primary interface).
     fn text_message(&mut self, text: &str);
     /// Opens a popup.
     fn popup(&mut self, popup: &Popup) {
         self.text_message(&popup.text);
     }
-    /// Whether a popup is open; blocking popups wait for false.
+    /// Whether a popup is open; a blocking popup waits for false.
     fn popup_open(&self) -> bool {
         false
     }
     /// Closes a popup.
     fn close_popup(&mut self) {}
 
-    /// Stops the program (or pauses it) unless input `name` is written at `min_frequency` Hz.
+    /// Sets a watchdog: stops or pauses the program unless input `name` is written at `min_frequency` Hz.
     ///
     /// # Errors
-    /// Unknown input name or frequency out of range.
+    /// The input is unknown or the frequency out of range.
     fn set_watchdog(&mut self, name: &str, min_frequency: f64, action: WatchdogAction) -> Result<(), HostError>;
-    /// Stops the arm as a safety event.
+    /// Stops the arm protectively.
     fn protective_stop(&mut self);
 
-    /// Active TCP in the flange frame.
+    /// Sets the active TCP in the flange frame.
     fn set_tcp(&mut self, tcp: &PoseVector);
-    /// Payload in kg and its centre of gravity in m (`None` keeps the present one).
+    /// Sets the payload in kg and its centre of gravity in m (`None` keeps the present one).
     ///
     /// # Errors
     /// Mass out of range.
@@ -267,12 +295,12 @@ pub trait Host {
     fn digital_out(&self, kind: OutputKind, index: usize) -> bool;
     /// Sets a digital output.
     fn set_digital_out(&mut self, kind: OutputKind, index: usize, value: bool);
-    /// Analog input, V or A by its domain.
+    /// Analog input, V or A depending on its domain.
     fn analog_in(&self, kind: OutputKind, index: usize) -> f64;
-    /// Sets a standard analog output, 0 to 1 of its range.
+    /// Sets a standard analog output as a fraction (0 to 1) of its range.
     fn set_analog_out(&mut self, index: usize, value: f64);
 
-    /// Opens connection `name`; called again with the same arguments in later steps while `Pending`. Never blocks.
+    /// Opens connection `name`; called again with the same arguments while `Pending`. Never blocks.
     fn socket_connect(&mut self, name: &str, address: &str, port: u16) -> Connect {
         let _ = (name, address, port);
         Connect::Failed
@@ -281,19 +309,43 @@ pub trait Host {
     fn socket_close(&mut self, name: &str) {
         let _ = name;
     }
-    /// Sends all bytes, or closes the connection and says false. Never blocks.
+    /// Sends all bytes; on failure closes the connection and returns false. Never blocks.
     fn socket_send(&mut self, name: &str, bytes: &[u8]) -> bool {
         let _ = (name, bytes);
         false
     }
-    /// Bytes that have arrived since the last call. Never blocks.
+    /// Bytes received since the last call. Never blocks.
     fn socket_receive(&mut self, name: &str) -> Received {
         let _ = name;
         Received::Closed
     }
 
-    /// Settings that the interpreter accepts without meaning of its own (`force_mode`, `zero_ftsensor`, `set_gravity`,
-    /// `freedrive_mode`, ...), with their arguments in order: to be recorded, or refused in a state that does not allow them.
+    /// Begins or changes force mode.
+    ///
+    /// # Errors
+    /// Force mode is not possible in this state.
+    fn force_mode(&mut self, mode: &ForceMode) -> Result<(), HostError> {
+        let _ = mode;
+        Err(HostError::Refused("force_mode: this host has no force control".to_owned()))
+    }
+    /// Ends force mode.
+    fn end_force_mode(&mut self) {}
+
+    /// Sends an HTTP POST request with an XML body. Never blocks; returns a number for [`Host::rpc_poll`].
+    ///
+    /// # Errors
+    /// The URL is invalid, or too many calls are under way.
+    fn rpc_begin(&mut self, url: &str, body: &str) -> Result<u32, HostError> {
+        let _ = (url, body);
+        Err(HostError::Refused("rpc_factory: this host makes no remote procedure calls".to_owned()))
+    }
+    /// Progress of a request.
+    fn rpc_poll(&mut self, call: u32) -> Remote {
+        let _ = call;
+        Remote::Failed("no such call".to_owned())
+    }
+
+    /// A function that is accepted without effect, with its arguments: may be refused in a state that does not allow it.
     ///
     /// # Errors
     /// Refused in this state.
@@ -301,10 +353,10 @@ pub trait Host {
         let _ = (name, arguments);
         Ok(())
     }
-    /// Any function that the interpreter does not know: return its value, or `UnknownFunction` as by default.
+    /// A query function that the interpreter does not evaluate itself, with its arguments.
     ///
     /// # Errors
-    /// Unknown to this host too, or refused.
+    /// The host does not know the function, or refuses.
     fn call(&mut self, name: &str, arguments: &[Value]) -> Result<Value, HostError> {
         let _ = arguments;
         Err(HostError::UnknownFunction(name.to_owned()))

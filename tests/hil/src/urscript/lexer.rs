@@ -1,8 +1,8 @@
-//! Text to tokens, with line numbers. Indentation means nothing; a line's end means nothing within brackets.
+//! Lexer. Indentation has no meaning, nor have line ends within brackets.
 
 use super::error::ScriptError;
 
-/// Longest text that is taken: 1 MiB, twenty times the largest published driver script.
+/// Largest program: 1 MiB, twenty times the largest published driver script.
 pub(crate) const MAX_SOURCE_BYTES: usize = 1 << 20;
 
 #[derive(Clone, Debug, PartialEq)]
@@ -26,17 +26,18 @@ pub(crate) struct Lexed {
 const SYMBOLS: [&str; 20] =
     ["==", "!=", "<=", ">=", "(", ")", "[", "]", ",", ":", "=", "<", ">", "+", "-", "*", "/", "%", ".", ";"];
 
-pub(crate) fn lex(text: &str) -> Result<Vec<Lexed>, ScriptError> {
+/// Splits a text into tokens; its first line has number `first_line`.
+pub(crate) fn lex(text: &str, first_line: u32) -> Result<Vec<Lexed>, ScriptError> {
     if text.len() > MAX_SOURCE_BYTES {
         return Err(ScriptError::new(
-            1,
-            format!("program of {} bytes; at most {MAX_SOURCE_BYTES} are taken", text.len()),
+            first_line,
+            format!("the program has {} bytes, the maximum is {MAX_SOURCE_BYTES}", text.len()),
         ));
     }
     let mut out = Vec::new();
     let mut brackets = 0_usize;
     for (number, raw) in text.split('\n').enumerate() {
-        let line = u32::try_from(number + 1).unwrap_or(u32::MAX);
+        let line = u32::try_from(number).unwrap_or(u32::MAX).saturating_add(first_line);
         let before = out.len();
         lex_line(raw, line, &mut brackets, &mut out)?;
         if out.len() > before && brackets == 0 {
@@ -47,7 +48,7 @@ pub(crate) fn lex(text: &str) -> Result<Vec<Lexed>, ScriptError> {
 }
 
 fn lex_line(raw: &str, line: u32, brackets: &mut usize, out: &mut Vec<Lexed>) -> Result<(), ScriptError> {
-    // Polyscope marks the program node of the following lines with `$ 12 "text"`: no statement.
+    // PolyScope marks the program node of the following lines with `$ 12 "text"`, which is not a statement.
     if raw.trim_start().starts_with('$') {
         return Ok(());
     }
@@ -66,7 +67,7 @@ fn lex_line(raw: &str, line: u32, brackets: &mut usize, out: &mut Vec<Lexed>) ->
         } else if first == '"' || first == '\'' {
             let body = &rest[1..];
             let Some(n) = body.find(first) else {
-                return Err(ScriptError::new(line, "the string is not closed on its line"));
+                return Err(ScriptError::new(line, "the string has no closing quote on its line"));
             };
             (Token::Text(body[..n].to_owned()), n + 2)
         } else if let Some(s) = SYMBOLS.iter().find(|s| rest.starts_with(**s)) {
@@ -76,8 +77,10 @@ fn lex_line(raw: &str, line: u32, brackets: &mut usize, out: &mut Vec<Lexed>) ->
                 _ => {}
             }
             (Token::Symbol(s), s.len())
+        } else if first == '\u{feff}' {
+            return Err(ScriptError::new(line, "the text begins with a byte order mark; save it as UTF-8 without one"));
         } else {
-            return Err(ScriptError::new(line, format!("character {first:?} is not URScript")));
+            return Err(ScriptError::new(line, format!("unexpected character {first:?}")));
         };
         out.push(Lexed { token, line });
         rest = &rest[used..];
@@ -85,7 +88,7 @@ fn lex_line(raw: &str, line: u32, brackets: &mut usize, out: &mut Vec<Lexed>) ->
 }
 
 fn number(rest: &str, line: u32) -> Result<(Token, usize), ScriptError> {
-    let wrong = |text: &str| ScriptError::new(line, format!("'{text}' is not a number that a controller can hold"));
+    let wrong = |text: &str| ScriptError::new(line, format!("'{text}' is not a number, or out of range"));
     let bytes = rest.as_bytes();
     if rest.starts_with("0x") || rest.starts_with("0X") {
         let n = 2 + bytes[2..].iter().take_while(|b| b.is_ascii_hexdigit()).count();

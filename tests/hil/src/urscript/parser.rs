@@ -1,13 +1,13 @@
-//! Tokens to a tree: statements and functions. Expressions are in `expression.rs`.
+//! Parser of statements and functions. Expressions are parsed in `expression.rs`.
 
 use super::ast::{Function, FunctionKind, Parameter, Scope, Stmt, StmtKind};
 use super::error::ScriptError;
 use super::lexer::{Lexed, Token};
 
-/// Nesting of blocks and brackets that is taken. Far above real scripts, far below a thread's stack.
+/// Nesting depth of blocks and brackets: far above real scripts, far below the stack limit of a thread.
 pub(crate) const MAX_NESTING: u32 = 48;
 
-/// Words that cannot name a variable or a function.
+/// Words that cannot be names of variables or functions.
 const KEYWORDS: [&str; 25] = [
     "def",
     "thread",
@@ -43,7 +43,7 @@ pub(crate) struct Parser<'t> {
     loops: u32,
 }
 
-/// Statements of the whole text.
+/// Parses the statements of a text.
 pub(crate) fn parse(tokens: &[Lexed]) -> Result<Vec<Stmt>, ScriptError> {
     let mut parser = Parser { tokens, at: 0, nesting: 0, loops: 0 };
     let body = parser.block(&[])?;
@@ -104,7 +104,7 @@ impl<'t> Parser<'t> {
         if self.take_symbol(symbol) { Ok(()) } else { Err(self.expected(&format!("'{symbol}'"))) }
     }
 
-    /// A name that is not a keyword.
+    /// Parses a name that is not a keyword.
     pub(crate) fn identifier(&mut self, what: &str) -> Result<String, ScriptError> {
         match self.peek() {
             Some(Token::Name(n)) if !KEYWORDS.contains(&n.as_str()) => {
@@ -123,7 +123,10 @@ impl<'t> Parser<'t> {
         Ok(())
     }
 
-    /// Statements up to one of the closing words (not taken), or to the end of the text where there are none.
+    /// Parses statements up to one of the closing words (not consumed), or to the end of the text if there are none.
+    ///
+    /// A line may hold several statements: a name cannot continue an expression, so it begins the next statement. Programs in
+    /// the field write `x = -0.2 show(x)`, and interpreter mode needs functions on one line.
     fn block(&mut self, closers: &[&str]) -> Result<Vec<Stmt>, ScriptError> {
         self.deeper()?;
         let opened = self.line();
@@ -142,20 +145,13 @@ impl<'t> Parser<'t> {
                 break;
             }
             out.push(self.statement()?);
-            let ended =
-                matches!(self.peek(), None | Some(Token::Newline)) || self.is_symbol(";") || self.opens_statement();
-            if !ended && !closers.iter().any(|c| self.is_word(c)) {
+            let ended = matches!(self.peek(), None | Some(Token::Newline | Token::Name(_))) || self.is_symbol(";");
+            if !ended {
                 return Err(self.expected("the end of the statement"));
             }
         }
         self.nesting -= 1;
         Ok(out)
-    }
-
-    /// Whether a keyword follows that can only begin a statement. A line's end is not needed before it: the script that SDU's
-    /// client uploads has `global a = # comment`, and on the next line the value and the next `global`.
-    fn opens_statement(&self) -> bool {
-        ["global", "local", "def", "thread", "if", "while", "return"].iter().any(|w| self.is_word(w))
     }
 
     fn statement(&mut self) -> Result<Stmt, ScriptError> {
@@ -280,15 +276,17 @@ impl<'t> Parser<'t> {
         let expr = self.expression()?;
         if !self.take_symbol("=") {
             return match expr.kind {
-                ExprKind::Call(..) | ExprKind::Run(_) => Ok(StmtKind::Expr(expr)),
-                _ => Err(ScriptError::new(expr.line, "syntax error: a value alone is no statement")),
+                ExprKind::Call(..) | ExprKind::Method(..) | ExprKind::Run(_) => Ok(StmtKind::Expr(expr)),
+                _ => Err(ScriptError::new(expr.line, "syntax error: a value is not a statement")),
             };
         }
         let (name, path) = match expr.kind {
             ExprKind::Name(name) => (name, Vec::new()),
             ExprKind::Index(base, path) => match base.kind {
                 ExprKind::Name(name) => (name, path),
-                _ => return Err(ScriptError::new(expr.line, "only a variable's element can be assigned")),
+                _ => {
+                    return Err(ScriptError::new(expr.line, "only an element or member of a variable can be assigned"));
+                }
             },
             _ => return Err(ScriptError::new(expr.line, "only a variable can be assigned")),
         };

@@ -1,62 +1,60 @@
-//! Built-in functions that need nothing but their arguments.
+//! Built-in functions that depend only on their arguments.
 
-use super::arithmetic::{Outcome, whole};
+use super::arithmetic::{MAX_MATRIX, MAX_TEXT_BYTES, Outcome, whole};
 use super::value::Value;
-use nalgebra::{Isometry3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{DMatrix, Isometry3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
-/// Longest list that `make_list` gives, plus one.
+/// Length limit of `make_list`, exclusive.
 const MAX_LIST: usize = 10_000;
-/// Longest text that a script may build.
-pub(crate) const MAX_TEXT: usize = 16_384;
 
 pub(crate) fn number(v: &Value) -> Outcome<f64> {
-    v.as_f64().ok_or_else(|| format!("a number is needed, this is {}", v.type_name()))
+    v.as_f64().ok_or_else(|| format!("expected a number, got {}", v.type_name()))
 }
 
-/// A number that is finite; a robot never moves by NaN.
+/// A finite number; NaN must not reach a motion.
 pub(crate) fn finite(v: &Value) -> Outcome<f64> {
     let x = number(v)?;
-    if x.is_finite() { Ok(x) } else { Err(format!("a finite number is needed, this is {x}")) }
+    if x.is_finite() { Ok(x) } else { Err(format!("expected a finite number, got {x}")) }
 }
 
 pub(crate) fn six(v: &Value) -> Outcome<[f64; 6]> {
-    let values = v.as_six().ok_or_else(|| format!("six numbers are needed, this is {} ({v})", v.type_name()))?;
-    if values.iter().all(|x| x.is_finite()) { Ok(values) } else { Err(format!("six finite numbers are needed: {v}")) }
+    let values = v.as_six().ok_or_else(|| format!("expected six numbers, got {} ({v})", v.type_name()))?;
+    if values.iter().all(|x| x.is_finite()) { Ok(values) } else { Err(format!("expected six finite numbers, got {v}")) }
 }
 
 pub(crate) fn pose(v: &Value) -> Outcome<[f64; 6]> {
     match v {
         Value::Pose(_) => six(v),
-        _ => Err(format!("a pose p[...] is needed, this is {}", v.type_name())),
+        _ => Err(format!("expected a pose p[...], got {}", v.type_name())),
     }
 }
 
 pub(crate) fn text(v: &Value) -> Outcome<&str> {
     match v {
         Value::Str(s) => Ok(s),
-        _ => Err(format!("a string is needed, this is {}", v.type_name())),
+        _ => Err(format!("expected a string, got {}", v.type_name())),
     }
 }
 
 pub(crate) fn boolean(v: &Value) -> Outcome<bool> {
     match v {
         Value::Bool(b) => Ok(*b),
-        _ => Err(format!("a boolean is needed, this is {}", v.type_name())),
+        _ => Err(format!("expected a boolean, got {}", v.type_name())),
     }
 }
 
-/// A whole number from 0 below `limit`.
+/// An integer from 0 to `limit` - 1.
 pub(crate) fn index(v: &Value, limit: usize) -> Outcome<usize> {
     whole(v)
         .and_then(|i| usize::try_from(i).ok())
         .filter(|i| *i < limit)
-        .ok_or_else(|| format!("a whole number from 0 to {} is needed, this is {v}", limit - 1))
+        .ok_or_else(|| format!("expected an integer from 0 to {}, got {v}", limit - 1))
 }
 
 pub(crate) fn int32(v: &Value) -> Outcome<i32> {
     whole(v)
         .and_then(|i| i32::try_from(i).ok())
-        .ok_or_else(|| format!("a 32-bit whole number is needed, this is {} ({v})", v.type_name()))
+        .ok_or_else(|| format!("expected a 32-bit integer, got {} ({v})", v.type_name()))
 }
 
 fn isometry(p: &[f64; 6]) -> Isometry3<f64> {
@@ -77,10 +75,10 @@ fn three(v: &Value) -> Outcome<Vector3<f64>> {
     match v {
         Value::List(items) => match items.as_slice() {
             [x, y, z] => Ok(Vector3::new(number(x)?, number(y)?, number(z)?)),
-            _ => Err(format!("three numbers are needed, here are {}", items.len())),
+            _ => Err(format!("expected three numbers, got {}", items.len())),
         },
         Value::Pose(p) => Ok(Vector3::new(p[0], p[1], p[2])),
-        _ => Err(format!("three numbers are needed, this is {}", v.type_name())),
+        _ => Err(format!("expected three numbers, got {}", v.type_name())),
     }
 }
 
@@ -88,7 +86,7 @@ fn list(v: &Value) -> Outcome<Vec<f64>> {
     match v {
         Value::List(items) => items.iter().map(number).collect(),
         Value::Pose(p) => Ok(p.to_vec()),
-        _ => Err(format!("a list is needed, this is {}", v.type_name())),
+        _ => Err(format!("expected a list, got {}", v.type_name())),
     }
 }
 
@@ -100,7 +98,7 @@ fn rounded(x: f64) -> Outcome {
     if x.abs() <= f64::from(i32::MAX) { Ok(Value::Int(x as i32)) } else { Err(format!("{x} does not fit 32 bits")) }
 }
 
-/// Calls a pure built-in; `None` if `name` is not one. Arguments are bound already.
+/// Calls a pure built-in with bound arguments; `None` if `name` is not one.
 pub(crate) fn call(name: &str, a: &[Value]) -> Option<Outcome> {
     let none = Value::None;
     let [x, y, z] = [0, 1, 2].map(|i| a.get(i).unwrap_or(&none));
@@ -121,8 +119,10 @@ pub(crate) fn call(name: &str, a: &[Value]) -> Option<Outcome> {
         "r2d" => number(x).map(|x| Value::Float(x.to_degrees())),
         "norm" => norm(x),
         "normalize" => normalize(x),
-        "length" | "get_list_length" | "size" => count(x),
+        "length" | "get_list_length" => count(x),
+        "size" => size(x),
         "transpose" => transpose(x),
+        "inv" => inverse(x),
         "make_list" => index(x, MAX_LIST).map(|n| Value::List(vec![y.clone(); n])),
         "binary_list_to_integer" => bits_to_integer(x),
         "integer_to_binary_list" => {
@@ -165,14 +165,14 @@ pub(crate) fn call(name: &str, a: &[Value]) -> Option<Outcome> {
         "str_at" => text(x).and_then(|s| slice(s, y, 1)),
         "str_sub" => text(x).and_then(|s| match z {
             Value::None => slice(s, y, usize::MAX),
-            n => slice(s, y, index(n, MAX_TEXT)?),
+            n => slice(s, y, index(n, MAX_TEXT_BYTES)?),
         }),
         "str_find" => find(x, y, z),
         _ => return None,
     })
 }
 
-/// A force and torque at one frame, as seen from the frame that `from_to` leads to.
+/// Transforms a wrench into the frame at `from_to`.
 fn wrench_trans(from_to: &Value, wrench: &Value) -> Outcome {
     let (frame, w) = (frame(from_to)?, six(wrench)?);
     let (force, torque) = (Vector3::new(w[0], w[1], w[2]), Vector3::new(w[3], w[4], w[5]));
@@ -182,7 +182,7 @@ fn wrench_trans(from_to: &Value, wrench: &Value) -> Outcome {
     Ok(Value::floats(&[f.x, f.y, f.z, t.x, t.y, t.z]))
 }
 
-/// Absolute value of a number, Euclidean length of a list; of a pose that of its position.
+/// Absolute value of a number, Euclidean norm of a list, or of the position of a pose.
 fn norm(v: &Value) -> Outcome {
     match v {
         Value::Int(i) => Ok(Value::Int(i.wrapping_abs())),
@@ -198,7 +198,7 @@ fn normalize(v: &Value) -> Outcome {
     if n > 0.0 && n.is_finite() {
         Ok(Value::floats(&items.iter().map(|x| x / n).collect::<Vec<_>>()))
     } else {
-        Err("normalize: the list has no direction".to_owned())
+        Err("normalize: the list has zero length".to_owned())
     }
 }
 
@@ -213,18 +213,50 @@ fn count(v: &Value) -> Outcome {
 }
 
 fn transpose(v: &Value) -> Outcome {
-    let Value::List(rows) = v else { return Err(format!("a matrix is needed, this is {}", v.type_name())) };
+    let Value::List(rows) = v else { return Err(format!("expected a matrix, got {}", v.type_name())) };
     let rows: Vec<Vec<f64>> = rows.iter().map(list).collect::<Result<_, _>>()?;
     let width = rows.first().map_or(0, Vec::len);
     if rows.iter().any(|r| r.len() != width) {
-        return Err("rows of a matrix must be equally long".to_owned());
+        return Err("the rows of a matrix must have equal lengths".to_owned());
     }
     let column = |c: usize| Value::List(rows.iter().filter_map(|r| r.get(c).map(|x| Value::Float(*x))).collect());
     Ok(Value::List((0..width).map(column).collect()))
 }
 
+/// Number of elements; rows and columns of a matrix.
+fn size(v: &Value) -> Outcome {
+    match v {
+        Value::List(rows) => match rows.first() {
+            Some(Value::List(row)) => Ok(Value::List(
+                [rows.len(), row.len()].iter().map(|n| Value::Int(i32::try_from(*n).unwrap_or(i32::MAX))).collect(),
+            )),
+            _ => count(v),
+        },
+        _ => count(v),
+    }
+}
+
+/// Inverse of a square matrix or of a pose.
+fn inverse(v: &Value) -> Outcome {
+    if let Value::Pose(_) = v {
+        return frame(v).map(|p| from_isometry(&p.inverse()));
+    }
+    let Value::List(rows) = v else { return Err(format!("inv: expected a matrix or a pose, got {}", v.type_name())) };
+    let rows: Vec<Vec<f64>> = rows.iter().map(list).collect::<Result<_, _>>().map_err(|e| format!("inv: {e}"))?;
+    let n = rows.len();
+    if n == 0 || n > MAX_MATRIX || rows.iter().any(|r| r.len() != n) {
+        return Err(format!("inv: the matrix must be square with at most {MAX_MATRIX} rows"));
+    }
+    let m = DMatrix::from_row_iterator(n, n, rows.into_iter().flatten());
+    // Adding zero turns the negative zeros of the elimination into zeros.
+    let inverse = m.try_inverse().filter(|m| m.iter().all(|x| x.is_finite())).ok_or("inv: the matrix is singular")?;
+    Ok(Value::List(
+        inverse.row_iter().map(|r| Value::List(r.iter().map(|x| Value::Float(*x + 0.0)).collect())).collect(),
+    ))
+}
+
 fn bits_to_integer(v: &Value) -> Outcome {
-    let Value::List(bits) = v else { return Err(format!("a list of booleans is needed, this is {}", v.type_name())) };
+    let Value::List(bits) = v else { return Err(format!("expected a list of booleans, got {}", v.type_name())) };
     if bits.len() > 32 {
         return Err("more than 32 bits".to_owned());
     }
@@ -242,7 +274,11 @@ fn to_number(s: &str) -> Outcome {
 
 fn concatenate(a: &Value, b: &Value) -> Outcome {
     let out = format!("{a}{b}");
-    if out.len() > MAX_TEXT { Err(format!("a string of more than {MAX_TEXT} bytes")) } else { Ok(Value::Str(out)) }
+    if out.len() > MAX_TEXT_BYTES {
+        Err(format!("a string of more than {MAX_TEXT_BYTES} bytes"))
+    } else {
+        Ok(Value::Str(out))
+    }
 }
 
 fn slice(s: &str, from: &Value, n: usize) -> Outcome {
@@ -251,7 +287,7 @@ fn slice(s: &str, from: &Value, n: usize) -> Outcome {
 }
 
 fn find(s: &Value, target: &Value, from: &Value) -> Outcome {
-    let (s, target, from) = (text(s)?, text(target)?, index(from, MAX_TEXT)?);
+    let (s, target, from) = (text(s)?, text(target)?, index(from, MAX_TEXT_BYTES)?);
     let Some((start, _)) = s.char_indices().nth(from) else { return Ok(Value::Int(-1)) };
     let found = s.get(start..).and_then(|t| t.find(target).map(|n| t.get(..n).map_or(0, |h| h.chars().count())));
     Ok(Value::Int(found.and_then(|n| i32::try_from(n + from).ok()).unwrap_or(-1)))

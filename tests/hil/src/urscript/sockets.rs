@@ -1,51 +1,28 @@
-//! Sockets of a script: buffers between the host's bytes and the script's numbers, lines and texts.
+//! Sockets of a script: receive buffers, and conversion between bytes and numbers, lines and strings.
 
-use super::arithmetic::Outcome;
-use super::builtins::{Flow, Wait};
+use super::arithmetic::{MAX_TEXT_BYTES, Outcome};
 use super::host::{Connect, Host, Received};
-use super::pure::{MAX_TEXT, boolean, index, int32, number, text};
+use super::pure::{boolean, index, int32, number, text};
 use super::value::Value;
+use super::wait::{Flow, Read, SocketWait, Wait};
 use std::collections::BTreeMap;
 
-/// Sockets open at once.
+/// Sockets of a script.
 const MAX_SOCKETS: usize = 16;
-/// Bytes kept for a script that does not read; the oldest unread data is the peer's problem: the socket is closed.
+/// Bytes buffered for a script that does not read; beyond them the socket is closed.
 const MAX_BUFFER: usize = 1 << 16;
-/// Numbers per read; UR's limit is 30 for a list read.
+/// Numbers per read, exclusive; UR's limit is 30.
 const MAX_NUMBERS: usize = 256;
-/// Bytes of a prefix or suffix of `socket_read_string`.
-const MAX_MARK: usize = 256;
-/// Seconds after which an attempt to connect fails.
-const CONNECT_SECONDS: f64 = 2.0;
+/// Longest prefix or suffix of `socket_read_string`, bytes.
+const MAX_DELIMITER: usize = 256;
+/// Time after which an attempt to connect fails, s.
+const CONNECT_TIMEOUT_S: f64 = 2.0;
 
-/// Received and not yet read bytes by connection.
+/// Received bytes that the script has not read, by socket.
 #[derive(Default)]
 pub(crate) struct SocketBuffers(BTreeMap<String, Vec<u8>>);
 
-/// A blocking socket call under way.
-#[derive(Clone, Debug)]
-pub(crate) enum SocketWait {
-    Connect { name: String, address: String, port: u16, steps: u32 },
-    Read { name: String, what: Read, steps: Option<u32> },
-}
-
-/// What a read gives.
-#[derive(Clone, Debug)]
-pub(crate) enum Read {
-    Integers(usize),
-    Bytes(usize),
-    Floats(usize),
-    Line,
-    /// Everything that is there, or the text between two marks.
-    Any {
-        prefix: String,
-        suffix: String,
-    },
-    /// The number in a line `name number`.
-    Variable(String),
-}
-
-/// Control steps in `seconds`, at least one; `None` (for ever) for zero and less, as UR's timeout of 0.
+/// Control steps in `seconds`, at least one. `None` (no timeout) for zero and less, like UR's timeout of 0.
 fn steps(seconds: f64, host: &dyn Host) -> Option<u32> {
     (seconds > 0.0).then(|| (seconds / host.step_time()).ceil().clamp(1.0, 1e9) as u32)
 }
@@ -67,7 +44,7 @@ fn dispatch(function: &str, a: &[Value], host: &mut dyn Host, s: &mut SocketBuff
             }
             s.0.insert(name.clone(), Vec::new());
             let port = u16::try_from(index(y, 65_536)?).unwrap_or(0);
-            let steps = steps(CONNECT_SECONDS, host).unwrap_or(1);
+            let steps = steps(CONNECT_TIMEOUT_S, host).unwrap_or(1);
             resume(SocketWait::Connect { name, address: text(x)?.to_owned(), port, steps }, host, s)
         }
         "socket_close" => {
@@ -87,7 +64,7 @@ fn dispatch(function: &str, a: &[Value], host: &mut dyn Host, s: &mut SocketBuff
         "socket_read_line" => read(Read::Line, x, y, host, s),
         "socket_read_string" => {
             let escapes = boolean(a.get(3).unwrap_or(&none))?;
-            let what = Read::Any { prefix: mark(y, escapes)?, suffix: mark(z, escapes)? };
+            let what = Read::Any { prefix: delimiter(y, escapes)?, suffix: delimiter(z, escapes)? };
             read(what, x, a.get(4).unwrap_or(&none), host, s)
         }
         "socket_get_var" => {
@@ -102,18 +79,18 @@ fn dispatch(function: &str, a: &[Value], host: &mut dyn Host, s: &mut SocketBuff
     }
 }
 
-/// A prefix or suffix, its escapes read where the script asks for that.
-fn mark(v: &Value, escapes: bool) -> Outcome<String> {
+/// A prefix or suffix; escape sequences are interpreted on request.
+fn delimiter(v: &Value, escapes: bool) -> Outcome<String> {
     let plain = text(v)?;
-    if plain.len() > MAX_MARK {
-        return Err(format!("a prefix or suffix of more than {MAX_MARK} bytes"));
+    if plain.len() > MAX_DELIMITER {
+        return Err(format!("a prefix or suffix of more than {MAX_DELIMITER} bytes"));
     }
     Ok(if escapes { plain.replace("\\n", "\n").replace("\\r", "\r").replace("\\t", "\t") } else { plain.to_owned() })
 }
 
-/// Where `mark` begins in `bytes`.
-fn position(bytes: &[u8], mark: &str) -> Option<usize> {
-    if mark.is_empty() { Some(0) } else { bytes.windows(mark.len()).position(|w| w == mark.as_bytes()) }
+/// Position of `delimiter` in `bytes`.
+fn position(bytes: &[u8], delimiter: &str) -> Option<usize> {
+    if delimiter.is_empty() { Some(0) } else { bytes.windows(delimiter.len()).position(|w| w == delimiter.as_bytes()) }
 }
 
 fn send(bytes: &[u8], name: &str, host: &mut dyn Host, s: &SocketBuffers) -> Flow {
@@ -130,7 +107,7 @@ fn read(what: Read, name: &Value, timeout: &Value, host: &mut dyn Host, s: &mut 
     }
 }
 
-/// Goes on with a blocking call, once in each control step.
+/// Continues a blocking call, once in each control step.
 pub(crate) fn resume(wait: SocketWait, host: &mut dyn Host, s: &mut SocketBuffers) -> Outcome<Flow> {
     match wait {
         SocketWait::Connect { name, address, port, steps } => match host.socket_connect(&name, &address, port) {
@@ -156,7 +133,7 @@ pub(crate) fn resume(wait: SocketWait, host: &mut dyn Host, s: &mut SocketBuffer
     }
 }
 
-/// What a read returns after its timeout: a count of zero and fillers, or an empty text.
+/// Result of a read after its timeout: a count of zero and filler values, or an empty string.
 fn nothing(what: &Read) -> Value {
     let list = |n: usize, filler: Value| {
         let mut out = vec![Value::Int(0)];
@@ -190,7 +167,7 @@ impl SocketBuffers {
         }
     }
 
-    /// Takes what has arrived; false if no more can come.
+    /// Buffers received bytes; false if the connection is closed.
     fn fill(&mut self, name: &str, host: &mut dyn Host) -> bool {
         let Some(buffer) = self.0.get_mut(name) else { return false };
         match host.socket_receive(name) {
@@ -226,7 +203,7 @@ impl SocketBuffers {
                 Some(counted(buffer.drain(..*n).map(|b| Value::Int(i32::from(b))).collect()))
             }
             Read::Floats(n) => {
-                // `(1.0, 2.0)` up to the bracket.
+                // `(1.0, 2.0)` up to the closing bracket.
                 let end = buffer.iter().position(|c| *c == b')')?;
                 let line: Vec<u8> = buffer.drain(..=end).collect();
                 let text = String::from_utf8_lossy(&line);
@@ -241,7 +218,7 @@ impl SocketBuffers {
                 let end = line_end(buffer)?;
                 let line: Vec<u8> = buffer.drain(..=end).collect();
                 let text = String::from_utf8_lossy(&line);
-                Some(Value::Str(text.trim_end_matches(['\r', '\n']).chars().take(MAX_TEXT / 4).collect()))
+                Some(Value::Str(text.trim_end_matches(['\r', '\n']).chars().take(MAX_TEXT_BYTES / 4).collect()))
             }
             Read::Any { prefix, suffix } => {
                 let from = position(buffer, prefix)? + prefix.len();
@@ -250,7 +227,7 @@ impl SocketBuffers {
                 if suffix.is_empty() && n == 0 {
                     return None;
                 }
-                let n = n.min(MAX_TEXT / 4);
+                let n = n.min(MAX_TEXT_BYTES / 4);
                 let found = String::from_utf8_lossy(rest.get(..n).unwrap_or_default()).into_owned();
                 buffer.drain(..(from + n + suffix.len()).min(buffer.len()));
                 Some(Value::Str(found))

@@ -5,7 +5,7 @@ use std::fmt;
 /// A value of a script variable. A matrix is a list of equally long lists.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Value {
-    /// What a function without `return` gives.
+    /// Result of a function without `return`.
     None,
     /// `True` or `False`.
     Bool(bool),
@@ -19,7 +19,11 @@ pub enum Value {
     Pose([f64; 6]),
     /// `[...]`.
     List(Vec<Value>),
-    /// What `run` returns; never zero, so that scripts may keep 0 for "no thread".
+    /// `struct(name=value, ...)`: members in the order of their definition.
+    Struct(Vec<(String, Value)>),
+    /// Result of `rpc_factory`: URL of an XML-RPC server.
+    Rpc(String),
+    /// Result of `run`; never zero, because scripts use 0 for "no thread".
     Thread(u32),
 }
 
@@ -30,7 +34,7 @@ impl Value {
         Self::List(values.iter().copied().map(Self::Float).collect())
     }
 
-    /// The number, if this is one.
+    /// The value as a number, if it is one.
     #[must_use]
     pub fn as_f64(&self) -> Option<f64> {
         match self {
@@ -40,7 +44,7 @@ impl Value {
         }
     }
 
-    /// Six numbers of a list or a pose.
+    /// The six numbers of a list or a pose.
     #[must_use]
     pub fn as_six(&self) -> Option<[f64; 6]> {
         match self {
@@ -56,7 +60,7 @@ impl Value {
         }
     }
 
-    /// Name of the type, for messages.
+    /// Type name for messages.
     #[must_use]
     pub fn type_name(&self) -> &'static str {
         match self {
@@ -67,24 +71,28 @@ impl Value {
             Self::Str(_) => "a string",
             Self::Pose(_) => "a pose",
             Self::List(_) => "a list",
+            Self::Struct(_) => "a struct",
+            Self::Rpc(_) => "a remote procedure call handle",
             Self::Thread(_) => "a thread",
         }
     }
 
-    /// Scalars held, the value itself included: what bounds memory.
+    /// Number of scalars, including the value itself; bounds memory.
     pub(crate) fn weight(&self) -> usize {
         match self {
             Self::List(items) => 1 + items.iter().map(Self::weight).sum::<usize>(),
-            Self::Str(s) => 1 + s.len() / 8,
+            Self::Struct(members) => 1 + members.iter().map(|(n, v)| 1 + n.len() / 8 + v.weight()).sum::<usize>(),
+            Self::Str(s) | Self::Rpc(s) => 1 + s.len() / 8,
             Self::Pose(_) => 6,
             _ => 1,
         }
     }
 
-    /// Depth of nesting: 0 for a scalar, 1 for a list of scalars, 2 for a matrix.
+    /// Nesting depth: 0 for a scalar, 1 for a list of scalars, 2 for a matrix.
     pub(crate) fn depth(&self) -> usize {
         match self {
             Self::List(items) => 1 + items.iter().map(Self::depth).max().unwrap_or(0),
+            Self::Struct(members) => 1 + members.iter().map(|(_, v)| v.depth()).max().unwrap_or(0),
             _ => 0,
         }
     }
@@ -102,7 +110,7 @@ fn commas(f: &mut fmt::Formatter<'_>, items: impl Iterator<Item = impl fmt::Disp
 }
 
 impl fmt::Display for Value {
-    /// As `textmsg` and `to_str` write it: six significant digits at most, `True`/`False`, `p[...]`.
+    /// The form of `textmsg` and `to_str`: up to six significant digits, `True`/`False`, `p[...]`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::None => f.write_str("None"),
@@ -116,12 +124,20 @@ impl fmt::Display for Value {
                 commas(f, p.iter().map(|x| short_float(*x)))
             }
             Self::List(items) => commas(f, items.iter()),
+            Self::Struct(members) => {
+                f.write_str("struct(")?;
+                for (i, (name, value)) in members.iter().enumerate() {
+                    write!(f, "{}{name}={value}", if i > 0 { ", " } else { "" })?;
+                }
+                f.write_str(")")
+            }
+            Self::Rpc(url) => write!(f, "rpc({url})"),
             Self::Thread(id) => write!(f, "{id}"),
         }
     }
 }
 
-/// Six significant digits without trailing zeros, exponent form outside 1e-5 to 1e6: C's `%g`.
+/// Six significant digits without trailing zeros, exponent form outside 1e-5 to 1e6, like C's `%g`.
 fn short_float(x: f64) -> String {
     if x == 0.0 || !x.is_finite() {
         return format!("{x}");
@@ -140,7 +156,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn texts_are_short_and_exact() {
+    fn values_are_formatted_like_the_controller_does() {
         for (x, text) in
             [(1.0, "1"), (0.1, "0.1"), (-2.5, "-2.5"), (123456.0, "123456"), (1.23456789, "1.23457"), (0.002, "0.002")]
         {
@@ -151,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn six_numbers_only() {
+    fn as_six_accepts_exactly_six_numbers() {
         assert_eq!(Value::floats(&[1.0; 6]).as_six(), Some([1.0; 6]));
         assert_eq!(Value::floats(&[1.0; 5]).as_six(), None);
         assert_eq!(Value::List(vec![Value::Bool(true); 6]).as_six(), None);

@@ -1,4 +1,4 @@
-//! A scripted host for tests: registers and answers are fields, everything asked is recorded.
+//! A scripted host for tests: registers and answers are fields, calls are recorded.
 #![allow(dead_code, unreachable_pub, missing_docs, reason = "each test file uses a part of it")]
 
 use graspd_hil::urscript::{
@@ -6,7 +6,7 @@ use graspd_hil::urscript::{
     Received, RobotView, WatchdogAction,
 };
 
-/// A controller that records and answers from fields.
+/// A controller that answers from fields and records calls.
 pub struct Desk {
     pub ints: [i32; 48],
     pub floats: [f64; 48],

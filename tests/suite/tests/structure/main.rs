@@ -9,7 +9,8 @@ use std::path::{Path, PathBuf};
 /// Longest function, lines from the signature to the closing brace, unless it is listed.
 const MAX_FUNCTION_LINES: usize = 80;
 /// Functions that may be longer, each with its reason.
-const LONG_FUNCTIONS: &[(&str, &str, &str)] = &[];
+const LONG_FUNCTIONS: &[(&str, &str, &str)] =
+    &[("tests/hil/src/controller/variables.rs", "getter", "a table: one row for each RTDE output variable")];
 /// The crates, by folder.
 const CRATES: [&str; 6] = ["rt", "shm", "calib", "daemon", "tests/hil", "tests/suite"];
 

@@ -1,4 +1,4 @@
-//! The publishing loop: a camera's cycle, the arm at the instant of exposure, the images, the stamps.
+//! The publishing loop: camera timing, the arm at mid-exposure, images and time stamps.
 
 use super::faults::{Fault, Timed, disc};
 use super::joints::{Arm, now_ns};
@@ -17,16 +17,18 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Serial numbers of the simulated cameras.
 pub(super) const SERIALS: [&str; 2] = ["sim-left", "sim-right"];
-/// Exposure time that is stated, ns. Images are of one instant: at the speeds of a servo the blur would be a fraction of a pixel.
+/// Exposure time in the frame header, ns. Images show one instant: at servo speeds motion blur is a fraction of a pixel.
 const EXPOSURE_NS: u64 = 2_000_000;
-/// How long to wait for a look at the arm after the exposure, ns.
-const PATIENCE_NS: u64 = 8_000_000;
-/// A controller that said nothing for so long is not late but gone, ns.
-const SILENT_NS: u64 = 60_000_000;
-/// How fast the jaws move, m/s.
-const JAW_SPEED: f64 = 0.08;
+/// Longest wait for an arm sample taken after the exposure, ns.
+const MAX_SAMPLE_WAIT_NS: u64 = 8_000_000;
+/// Age of the newest sample above which the controller counts as gone rather than late, ns.
+const MAX_SAMPLE_AGE_NS: u64 = 60_000_000;
+/// Speed of the jaws, m/s.
+const JAW_SPEED_M_S: f64 = 0.08;
+/// Half the side of the windows that `swap_marks` exchanges, pixels.
+const HALF_WINDOW_PX: i64 = 10;
 
-/// What others may see of and change in the running scene.
+/// State shared with the console.
 #[derive(Debug, Default)]
 pub(super) struct Shared {
     inner: Mutex<Inner>,
@@ -66,7 +68,7 @@ impl Shared {
         })
     }
 
-    /// Figures of the loop.
+    /// Statistics of the loop.
     pub(super) fn status(&self) -> Value {
         self.with(|i| {
             json!({ "published": i.published, "late": i.late, "render_us": i.render_us.round(), "opening_m": i.opening,
@@ -74,7 +76,7 @@ impl Shared {
         })
     }
 
-    /// The scene as it is now, an object that was moved included.
+    /// The present scenario, including displaced cameras and objects.
     pub(super) fn scenario(&self) -> Option<Scenario> {
         self.with(|i| i.scenario.as_deref().cloned())
     }
@@ -84,7 +86,7 @@ impl Shared {
     }
 }
 
-/// The loop's own state.
+/// State of the loop.
 pub(super) struct Loop {
     scenario: Scenario,
     renderer: StereoRenderer,
@@ -95,17 +97,17 @@ pub(super) struct Loop {
     latency_ns: u64,
     close_output: u32,
     opening: f64,
-    /// What faults hold on to: images and stamps of each eye, pose.
+    /// Image and time stamp of each camera, and the pose, repeated by faults.
     held: [Option<(Vec<u8>, u64)>; 2],
     held_pose: Option<[Option<Pose>; 2]>,
-    /// A renderer being made for cameras or an object that moved, and the faults it is made for.
+    /// Displacement faults of the newest renderer, and the renderer that is being built.
     moved: Vec<Fault>,
     pending: Option<Receiver<(Scenario, StereoRenderer)>>,
     second: Option<(ShmNode, FramePublisher)>,
 }
 
 impl Loop {
-    /// Joins the topic. Must run on the thread that publishes.
+    /// Opens the topic. Must run on the publishing thread.
     pub(super) fn new(
         scenario: Scenario,
         renderer: StereoRenderer,
@@ -138,7 +140,7 @@ impl Loop {
         })
     }
 
-    /// Publishes until `stop`; calls `ready` once, after the first pair is out.
+    /// Publishes until `stop`; calls `ready` once, after the first pair.
     pub(super) fn run(mut self, node: &ShmNode, stop: &AtomicBool, ready: impl FnOnce()) -> Result<(), ShmError> {
         let start = now_ns();
         let mut capture = start;
@@ -152,7 +154,7 @@ impl Loop {
             capture += period;
             let now = now_ns();
             if capture < now.saturating_sub(self.latency_ns) {
-                // Too late for this cycle: leave out whole cycles and keep the grid.
+                // Too late for this cycle: skip whole cycles and keep the time grid.
                 let lost = (now - self.latency_ns - capture).div_ceil(period);
                 for _ in 0..lost.min(1000) {
                     self.publisher.skip();
@@ -163,7 +165,7 @@ impl Loop {
             }
             sleep_until(capture + self.latency_ns);
             if !self.wait_for_arm(capture) {
-                // Nobody knows where the arm was then: a pair less is honest, a wrong one is not.
+                // The arm's pose at the exposure is unknown: a missing pair is better than a wrong one.
                 self.publisher.skip();
                 self.shared.with(|i| i.late += 1);
                 continue;
@@ -176,18 +178,18 @@ impl Loop {
         Ok(())
     }
 
-    /// Waits until the arm was looked at after the exposure, so that its joints then lie between two looks. False when a controller
-    /// that is connected and sending did not come in time.
+    /// Waits for an arm sample taken after the exposure, so that the joints can be interpolated. False if a connected and
+    /// sending controller was late.
     fn wait_for_arm(&self, capture: u64) -> bool {
         if !self.arm.link().0 {
             return true;
         }
-        let end = capture + self.latency_ns + PATIENCE_NS;
+        let end = capture + self.latency_ns + MAX_SAMPLE_WAIT_NS;
         while now_ns() < end && self.arm.newest().is_none_or(|s| s.at_ns < capture) {
             sleep_until(now_ns() + 500_000);
         }
-        // One that stands still for longer than that is a fault of the robot's, not of the cameras, which go on.
-        self.arm.newest().is_none_or(|s| s.at_ns >= capture || capture - s.at_ns > SILENT_NS)
+        // A longer silence is a fault of the robot; the cameras continue.
+        self.arm.newest().is_none_or(|s| s.at_ns >= capture || capture - s.at_ns > MAX_SAMPLE_AGE_NS)
     }
 
     /// Renders and publishes one pair.
@@ -214,23 +216,23 @@ impl Loop {
         let swap = active.iter().any(|f| matches!(f, Fault::Swap { .. }));
         let targets = if swap { [right, left] } else { [left, right] };
         for view in View::BOTH {
-            let eye = view.index();
-            let image = &mut *targets[eye];
-            let freeze = active.iter().any(|f| matches!(f, Fault::Freeze { eye: e } if e.is_none_or(|e| e == eye)));
-            let stopped = active.iter().any(|f| matches!(f, Fault::Stop { eye: Some(e) } if *e == eye));
-            if let Some((old, stamp)) = self.held[eye].as_ref().filter(|_| freeze || stopped) {
+            let camera = view.index();
+            let image = &mut *targets[camera];
+            let freeze = active.iter().any(|f| matches!(f, Fault::Freeze { eye } if eye.is_none_or(|e| e == camera)));
+            let stopped = active.iter().any(|f| matches!(f, Fault::Stop { eye: Some(e) } if *e == camera));
+            if let Some((old, stamp)) = self.held[camera].as_ref().filter(|_| freeze || stopped) {
                 image.copy_from_slice(old);
                 if stopped {
-                    stamps[eye] = *stamp;
+                    stamps[camera] = *stamp;
                 }
                 continue;
             }
             self.renderer.draw(view, &shot, image, w);
             for f in active {
-                f.spoil(eye, image, w, h, t_s, trigger * 2 + eye as u64);
-                marks_fault(f, &self.scenario, view, &shot, image, (w, h));
+                f.degrade_image(camera, image, w, h, t_s, trigger * 2 + camera as u64);
+                degrade_marks(f, &self.scenario, view, &shot, image, (w, h));
             }
-            self.held[eye] = if freeze || stopped { Some((image.to_vec(), stamps[eye])) } else { None };
+            self.held[camera] = if freeze || stopped { Some((image.to_vec(), stamps[camera])) } else { None };
         }
         let render_us = (now_ns() - before) as f64 * 1e-3;
         let stamp = FrameStamp {
@@ -241,7 +243,7 @@ impl Loop {
             trigger,
             flags: flags::SYNCHRONISED,
         };
-        loan.send_with(&stamp, |h| active.iter().for_each(|f| f.lie(h, t_s)))?;
+        loan.send_with(&stamp, |h| active.iter().for_each(|f| f.corrupt_header(h, t_s)))?;
         self.second_publisher(node, active, &stamp)?;
         let opening = self.opening;
         self.shared.with(|i| {
@@ -252,11 +254,11 @@ impl Loop {
         Ok(())
     }
 
-    /// Where gripper and jaws are at the eyes' stamps, faults included.
+    /// Gripper pose and jaw opening at the cameras' time stamps, including faults.
     fn snapshot(&mut self, active: &[Fault], stamps: [u64; 2], frame: u64) -> Snapshot {
         let mut pose = stamps.map(|t| self.arm.at(t).map(|s| self.scenario.object_from_gripper(&s.q)));
         let outputs = self.arm.at(stamps[0]).map_or(0, |s| s.outputs);
-        // Jaws close until they touch the rim when it is between them, else to their stop.
+        // The jaws close to the rim if it is between them, else completely.
         let [least, most] = self.scenario.gripper.opening;
         let close = outputs >> self.close_output.min(63) & 1 == 1;
         let grasped = pose[0].is_some_and(|p| p.translation.vector.norm() < 0.02);
@@ -268,7 +270,7 @@ impl Loop {
         } else {
             least
         };
-        let step = JAW_SPEED / self.rate;
+        let step = JAW_SPEED_M_S / self.rate;
         self.opening += (goal - self.opening).clamp(-step, step);
         let mut hidden_marks = 0;
         let mut hold = false;
@@ -291,7 +293,7 @@ impl Loop {
         Snapshot { object_from_gripper: pose, opening: self.opening, frame, hidden_marks }
     }
 
-    /// Starts, and takes over, new fixed layers when a camera is knocked or the object moved.
+    /// Starts rendering new fixed layers when a camera or the object is displaced, and takes them over when finished.
     fn follow_moves(&mut self, active: &[Fault]) {
         if let Some((scenario, renderer)) = self.pending.as_ref().and_then(|p| p.try_recv().ok()) {
             (self.scenario, self.renderer) = (scenario, renderer);
@@ -306,7 +308,7 @@ impl Loop {
         if moves == self.moved || self.pending.is_some() {
             return;
         }
-        // Undo what was, do what is now.
+        // Revert the previous displacements, apply the present ones.
         let mut s = self.scenario.clone();
         for (list, sign) in [(&self.moved, -1.0), (&moves, 1.0)] {
             let order: Vec<&Fault> = if sign < 0.0 { list.iter().rev().collect() } else { list.iter().collect() };
@@ -344,13 +346,13 @@ impl Loop {
     }
 }
 
-/// Moves a camera or the object, forth (`sign` 1) or back (-1).
+/// Displaces a camera or the object (`sign` 1), or reverts that (-1).
 fn displace(s: &mut Scenario, f: &Fault, sign: f64) {
     match f {
         Fault::KnockCamera { eye, mm, deg } => {
             let turn = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), deg.to_radians());
             let knock = Pose::from_parts(Vector3::new(mm * 1e-3, 0.0, 0.0).into(), turn);
-            // New camera coordinates of a point from the old ones.
+            // new_from_old coordinates of the camera.
             let knock = if sign > 0.0 { knock } else { knock.inverse() };
             if *eye == 0 {
                 s.base_from_left *= knock.inverse();
@@ -364,8 +366,8 @@ fn displace(s: &mut Scenario, f: &Fault, sign: f64) {
     }
 }
 
-/// Faults that need to know where marks are.
-fn marks_fault(f: &Fault, s: &Scenario, view: View, shot: &Snapshot, image: &mut [u8], (w, h): (usize, usize)) {
+/// Applies the faults that depend on the positions of marks.
+fn degrade_marks(f: &Fault, s: &Scenario, view: View, shot: &Snapshot, image: &mut [u8], (w, h): (usize, usize)) {
     let at = |mark: usize| -> Option<Pixel> {
         let m = s.gripper.gripper.marks.get(mark)?;
         let left = s.left_from_object() * shot.object_from_gripper[view.index()]?;
@@ -379,7 +381,7 @@ fn marks_fault(f: &Fault, s: &Scenario, view: View, shot: &Snapshot, image: &mut
         }
         Fault::SwapMarks { a, b } => {
             if let (Some(p), Some(q)) = (at(*a), at(*b)) {
-                swap_windows(image, (w, h), p, q, 10);
+                swap_windows(image, (w, h), p, q, HALF_WINDOW_PX);
             }
         }
         _ => {}

@@ -1,11 +1,13 @@
-//! Names, parameters and defaults of the built-in functions, and the binding of arguments to them.
+//! The functions of UR's script manual (software 5.x): implemented, accepted without effect, or refused at upload.
+//!
+//! docs/MOCK-UR.md lists the second and the third group; a test compares it with these tables.
 
 use super::arithmetic::Outcome;
 use super::value::Value;
 
-/// `name` must be given, `name=default` need not; `name=?` has no value when it is left out.
-const SIGNATURES: &[(&str, &str)] = &[
-    // Motion. Defaults of the script manual.
+/// Functions that are implemented, with their parameters: `name` is required, `name=default` optional; `name=?` is optional without a default.
+const IMPLEMENTED: &[(&str, &str)] = &[
+    // Motion; defaults of the script manual.
     ("movej", "q a=1.4 v=1.05 t=0 r=0"),
     ("movel", "pose a=1.2 v=0.25 t=0 r=0"),
     ("movep", "pose a=1.2 v=0.25 r=0"),
@@ -16,6 +18,30 @@ const SIGNATURES: &[(&str, &str)] = &[
     ("speedl", "xd a=1.4 t=0 aRot=0"),
     ("stopj", "a"),
     ("stopl", "a aRot=0"),
+    ("force_mode", "task_frame selection_vector wrench type limits"),
+    ("end_force_mode", ""),
+    ("force_mode_set_damping", "damping"),
+    ("force_mode_set_gain_scaling", "scaling"),
+    ("zero_ftsensor", ""),
+    ("interpreter_mode", "clearQueueOnEnter=True clearOnEnd=True"),
+    ("end_interpreter", ""),
+    ("clear_interpreter", ""),
+    // Encoders: two counters that scripts set.
+    ("encoder_enable_pulse_decode", "encoder_index decoder_type A B"),
+    ("encoder_enable_set_tick_count", "encoder_index range_id"),
+    ("encoder_get_tick_count", "encoder_index"),
+    ("encoder_set_tick_count", "encoder_index count"),
+    ("encoder_unwind_delta_tick_count", "encoder_index delta_tick_count"),
+    ("get_conveyor_tick_count", ""),
+    ("set_conveyor_tick_count", "tick_count absolute_encoder_resolution=0"),
+    // Modbus signals, whose values a test sets on the control port.
+    ("modbus_add_signal", "IP slave_number signal_address signal_type signal_name sequential_mode=False"),
+    ("modbus_delete_signal", "signal_name"),
+    ("modbus_get_signal_status", "signal_name is_secondary_program=False"),
+    ("modbus_set_output_register", "signal_name register_value is_secondary_program=False"),
+    ("modbus_set_output_signal", "signal_name digital_value is_secondary_program=False"),
+    // Remote procedure calls.
+    ("rpc_factory", "type url"),
     // Registers.
     ("read_input_integer_register", "address"),
     ("read_input_float_register", "address"),
@@ -38,6 +64,9 @@ const SIGNATURES: &[(&str, &str)] = &[
     // State.
     ("get_actual_tcp_pose", ""),
     ("get_target_tcp_pose", ""),
+    ("get_target_tcp_pose_along_path", ""),
+    ("get_target_tcp_speed_along_path", ""),
+    ("get_target_waypoint", ""),
     ("get_actual_tool_flange_pose", ""),
     ("get_actual_tcp_speed", ""),
     ("get_target_tcp_speed", ""),
@@ -63,10 +92,14 @@ const SIGNATURES: &[(&str, &str)] = &[
     ("get_controller_temp", ""),
     ("get_tool_current", ""),
     ("get_tool_accelerometer_reading", ""),
-    // Settings with a meaning for the plant.
+    // Settings that affect the plant.
     ("set_tcp", "pose tcp_name=''"),
     ("set_payload", "m cog=?"),
     ("set_payload_mass", "m"),
+    ("set_payload_cog", "CoG"),
+    ("set_target_payload", "m cog=? inertia=? transition_time=0"),
+    ("set_tool_voltage", "voltage"),
+    ("powerdown", ""),
     ("rtde_set_watchdog", "variable_name min_frequency action='pause'"),
     ("protective_stop", ""),
     // Inputs and outputs.
@@ -83,6 +116,12 @@ const SIGNATURES: &[(&str, &str)] = &[
     ("set_tool_digital_out", "n b"),
     ("set_digital_out", "n b"),
     ("get_standard_analog_in", "n"),
+    ("get_standard_analog_out", "n"),
+    ("get_analog_out", "n"),
+    ("read_port_bit", "address"),
+    ("read_port_register", "address"),
+    ("write_port_bit", "address value"),
+    ("write_port_register", "address value"),
     ("get_tool_analog_in", "n"),
     ("set_standard_analog_out", "n f"),
     ("get_analog_in", "n"),
@@ -127,6 +166,7 @@ const SIGNATURES: &[(&str, &str)] = &[
     ("get_list_length", "v"),
     ("size", "v"),
     ("transpose", "m"),
+    ("inv", "m"),
     ("make_list", "length initial_value=0 capacity=?"),
     ("random", ""),
     ("binary_list_to_integer", "l"),
@@ -153,6 +193,115 @@ const SIGNATURES: &[(&str, &str)] = &[
     ("str_find", "src target start_from=0"),
 ];
 
+/// Functions that are accepted without effect, with their parameters.
+const WITHOUT_EFFECT: &[(&str, &str)] = &[
+    ("conveyor_pulse_decode", "type A B"),
+    ("enable_external_ft_sensor", "enable sensor_mass=0 sensor_measuring_offset=? sensor_cog=?"),
+    ("end_freedrive_mode", ""),
+    ("end_teach_mode", ""),
+    ("freedrive_mode", "freeAxes=? feature=?"),
+    ("freedrive_mode_no_incorrect_payload_check", ""),
+    ("ft_rtde_input_enable", "enable sensor_mass=0 sensor_measuring_offset=? sensor_cog=?"),
+    ("modbus_set_digital_input_action", "signal_name action"),
+    ("modbus_set_runstate_dependent_choice", "signal_name runstate_choice"),
+    ("modbus_set_signal_update_frequency", "signal_name update_frequency"),
+    ("modbus_set_signal_watchdog", "signal_name new_timeout_in_sec"),
+    ("pause_on_error_code", "code argument=?"),
+    ("position_deviation_warning", "enabled threshold=0.8"),
+    ("reset_revolution_counter", "qNear=?"),
+    ("set_analog_inputrange", "port range"),
+    ("set_analog_outputdomain", "port domain"),
+    ("set_configurable_digital_input_action", "port action"),
+    ("set_gp_boolean_input_action", "port action"),
+    ("set_gravity", "d"),
+    ("set_input_actions_to_default", ""),
+    ("set_runstate_configurable_digital_output_to_value", "outputId state"),
+    ("set_runstate_gp_boolean_output_to_value", "outputId state"),
+    ("set_runstate_outputs", "outputs"),
+    ("set_runstate_standard_analog_output_to_value", "outputId state"),
+    ("set_runstate_standard_digital_output_to_value", "outputId state"),
+    ("set_runstate_tool_digital_output_to_value", "outputId state"),
+    ("set_safety_mode_transition_hardness", "type"),
+    ("set_standard_analog_input_domain", "port domain"),
+    ("set_standard_digital_input_action", "port action"),
+    ("set_tool_analog_input_domain", "port domain"),
+    ("set_tool_communication", "enabled baud_rate parity stop_bits rx_idle_chars tx_idle_chars"),
+    ("set_tool_digital_input_action", "port action"),
+    ("set_tool_digital_output_mode", "n mode"),
+    ("set_tool_output_mode", "mode"),
+    ("teach_mode", ""),
+];
+
+/// Functions of the manual that are refused at upload, because ignoring them would change the motion or the result.
+const REFUSED: &[&str] = &[
+    "direct_torque",
+    "end_screw_driving",
+    "get_coriolis_and_centrifugal_torques",
+    "get_euromap_input",
+    "get_euromap_output",
+    "get_jacobian_time_derivative",
+    "get_mass_matrix",
+    "mc_add_circular",
+    "mc_add_linear",
+    "mc_add_path",
+    "mc_get_target_rtcp_speed",
+    "mc_initialize",
+    "mc_load_path",
+    "mc_run_motion",
+    "mc_set_pcs",
+    "mc_set_speed_factor",
+    "modbus_send_custom_command",
+    "optimovej",
+    "optimovel",
+    "path_offset_disable",
+    "path_offset_enable",
+    "path_offset_get",
+    "path_offset_set",
+    "path_offset_set_alpha_filter",
+    "path_offset_set_max_offset",
+    "screw_driving",
+    "set_euromap_input_action",
+    "set_euromap_output",
+    "set_euromap_runstate_dependent_choice",
+    "set_pos",
+    "stop_conveyor_tracking",
+    "track_conveyor_circular",
+    "track_conveyor_linear",
+];
+
+/// What the mock does with a function.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Support {
+    Implemented,
+    WithoutEffect,
+    Refused,
+    Unknown,
+}
+
+/// What the mock does with function `name`.
+pub(crate) fn support(name: &str) -> Support {
+    let in_table = |table: &[(&str, &str)]| table.iter().any(|(n, _)| *n == name);
+    if in_table(IMPLEMENTED) {
+        Support::Implemented
+    } else if in_table(WITHOUT_EFFECT) {
+        Support::WithoutEffect
+    } else if REFUSED.contains(&name) {
+        Support::Refused
+    } else {
+        Support::Unknown
+    }
+}
+
+/// Names of the functions that are accepted without effect.
+pub fn accepted_without_effect() -> impl Iterator<Item = &'static str> {
+    WITHOUT_EFFECT.iter().map(|(name, _)| *name)
+}
+
+/// Names of the documented functions that are refused at upload.
+pub fn refused() -> impl Iterator<Item = &'static str> {
+    REFUSED.iter().copied()
+}
+
 fn default(text: &str) -> Option<Value> {
     match text {
         "?" => Some(Value::None),
@@ -167,9 +316,9 @@ fn default(text: &str) -> Option<Value> {
     }
 }
 
-/// Arguments in the order of the parameters, defaults filled in; `None` if there is no built-in of this name.
+/// Arguments in the order of the parameters, with defaults filled in; `None` if there is no built-in of this name.
 pub(crate) fn bind(function: &str, given: Vec<Value>, names: &[Option<String>]) -> Option<Outcome<Vec<Value>>> {
-    let (_, spec) = SIGNATURES.iter().find(|(n, _)| *n == function)?;
+    let (_, spec) = IMPLEMENTED.iter().chain(WITHOUT_EFFECT).find(|(n, _)| *n == function)?;
     let parameters: Vec<(&str, Option<&str>)> = spec
         .split_whitespace()
         .map(|p| p.split_once('=').map_or((p, None), |(name, default)| (name, Some(default))))
@@ -177,6 +326,7 @@ pub(crate) fn bind(function: &str, given: Vec<Value>, names: &[Option<String>]) 
     Some(bind_to(function, &parameters, given, names))
 }
 
+/// Binds positional and named arguments. `t_min` is the name of `t` in manuals before software 3.0, which urx still uses.
 fn bind_to(
     function: &str,
     parameters: &[(&str, Option<&str>)],
@@ -188,7 +338,7 @@ fn bind_to(
         let at = match name {
             Some(n) => parameters
                 .iter()
-                .position(|(p, _)| p == n)
+                .position(|(p, _)| p == n || (n == "t_min" && *p == "t"))
                 .ok_or_else(|| format!("'{function}' has no argument '{n}'"))?,
             None => i,
         };
@@ -212,9 +362,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_default_can_be_read_and_no_name_is_listed_twice() {
-        for (i, (name, spec)) in SIGNATURES.iter().enumerate() {
-            assert!(SIGNATURES.iter().skip(i + 1).all(|(n, _)| n != name), "{name}");
+    fn defaults_are_valid_and_names_are_unique() {
+        let all: Vec<_> =
+            IMPLEMENTED.iter().chain(WITHOUT_EFFECT).copied().chain(REFUSED.iter().map(|n| (*n, ""))).collect();
+        for (i, (name, spec)) in all.iter().enumerate() {
+            assert!(all.iter().skip(i + 1).all(|(n, _)| n != name), "{name}");
             for p in spec.split_whitespace() {
                 if let Some((_, d)) = p.split_once('=') {
                     assert!(default(d).is_some(), "{name} {p}");

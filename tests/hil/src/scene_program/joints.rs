@@ -1,4 +1,4 @@
-//! The arm's true joints over time, learnt as a second, read-only RTDE client.
+//! The arm's joint positions over time, received as a second, read-only RTDE client.
 
 use graspd_rt::arm::Joints;
 use graspd_rt::rtde::{Event, FieldSlot, Framer, Session};
@@ -10,12 +10,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 /// Samples kept: half a second at 500 Hz.
-const KEEP: usize = 256;
+const MAX_SAMPLES: usize = 256;
+/// Longest gap between two samples that is interpolated, ns; a longer one is treated as a hold.
+const MAX_GAP_NS: u64 = 50_000_000;
 
-/// One look at the arm.
+/// One sample of the arm.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Sample {
-    /// When the controller took it, CLOCK_MONOTONIC nanoseconds.
+    /// Sampling time, CLOCK_MONOTONIC nanoseconds.
     pub(super) at_ns: u64,
     /// Measured joints, rad.
     pub(super) q: Joints,
@@ -23,7 +25,7 @@ pub(super) struct Sample {
     pub(super) outputs: u64,
 }
 
-/// The last half second of the arm.
+/// The latest samples.
 #[derive(Debug, Default)]
 struct History {
     samples: VecDeque<Sample>,
@@ -31,7 +33,7 @@ struct History {
     received: u64,
 }
 
-/// Shared view of the arm's recent past.
+/// Shared history of the arm.
 #[derive(Clone, Debug)]
 pub(super) struct Arm {
     history: Arc<Mutex<History>>,
@@ -43,7 +45,7 @@ pub(super) fn now_ns() -> u64 {
 }
 
 impl Arm {
-    /// An arm that stands still.
+    /// An arm at rest.
     pub(super) fn fixed(q: Joints) -> Self {
         let arm = Self { history: Arc::default() };
         arm.push(Sample { at_ns: 1, q, outputs: 0 });
@@ -57,32 +59,31 @@ impl Arm {
 
     fn push(&self, s: Sample) {
         let mut h = self.lock();
-        if h.samples.len() == KEEP {
+        if h.samples.len() == MAX_SAMPLES {
             h.samples.pop_front();
         }
         h.samples.push_back(s);
         h.received += 1;
     }
 
-    /// Whether the controller is connected, and how many packages came from it.
+    /// Whether the controller is connected, and the number of packages received.
     pub(super) fn link(&self) -> (bool, u64) {
         let h = self.lock();
         (h.connected, h.received)
     }
 
-    /// The newest look at the arm.
+    /// The newest sample.
     pub(super) fn newest(&self) -> Option<Sample> {
         self.lock().samples.back().copied()
     }
 
-    /// Joints at an instant: between two looks in proportion, before the first or after the last one that one's.
+    /// Joint positions at a time: interpolated between two samples, constant before the first and after the last.
     pub(super) fn at(&self, t_ns: u64) -> Option<Sample> {
         let h = self.lock();
         let after = h.samples.partition_point(|s| s.at_ns <= t_ns);
         let (a, b) = (h.samples.get(after.saturating_sub(1))?, h.samples.get(after));
         let Some(b) = b.filter(|b| b.at_ns > a.at_ns && a.at_ns <= t_ns) else { return Some(*a) };
-        // A gap in the stream is a hold, not a slow glide.
-        if b.at_ns - a.at_ns > 50_000_000 {
+        if b.at_ns - a.at_ns > MAX_GAP_NS {
             return Some(*a);
         }
         let k = (t_ns - a.at_ns) as f64 / (b.at_ns - a.at_ns) as f64;
@@ -90,16 +91,16 @@ impl Arm {
         Some(Sample { at_ns: t_ns, q, outputs: a.outputs })
     }
 
-    /// Follows a controller until `stop`, reconnecting for ever; the images hold the last joints meanwhile.
+    /// Follows a controller until `stop`. Reconnects after a loss; the images show the last joints meanwhile.
     pub(super) fn follow(&self, address: String, stop: Arc<AtomicBool>) {
         let arm = self.clone();
         std::thread::spawn(move || {
-            crate::host::prefer_this_thread(crate::host::EXPOSURE, -12);
+            crate::host::prefer_this_thread(crate::host::EXPOSURE_FIFO, -12);
             let mut last = String::new();
             while !stop.load(Ordering::Relaxed) {
                 if let Err(e) = arm.session(&address, &stop) {
                     if e != last {
-                        eprintln!("graspd-scene: no joints from {address}: {e}; trying again");
+                        eprintln!("graspd-scene: no joint positions from {address}: {e}; retrying");
                         last = e;
                     }
                 } else {
@@ -111,10 +112,10 @@ impl Arm {
         });
     }
 
-    /// One connection, from the handshake to its end.
+    /// Runs one connection from the handshake to its end.
     fn session(&self, address: &str, stop: &AtomicBool) -> Result<(), String> {
         let text = |e: std::io::Error| e.to_string();
-        let target = address.to_socket_addrs().map_err(text)?.next().ok_or("the address names no host")?;
+        let target = address.to_socket_addrs().map_err(text)?.next().ok_or("the address resolves to no host")?;
         let mut stream = TcpStream::connect_timeout(&target, Duration::from_secs(2)).map_err(text)?;
         stream.set_nodelay(true).map_err(text)?;
         stream.set_read_timeout(Some(Duration::from_millis(500))).map_err(text)?;
@@ -125,7 +126,7 @@ impl Arm {
         let (Some(joints), Some(bits), Some(clock)) =
             (slots.slot::<Joints>(outputs[0]), slots.slot::<u64>(outputs[1]), slots.slot::<f64>(outputs[2]))
         else {
-            return Err("the protocol's tables lack actual_q".into());
+            return Err("actual_q is missing in the RTDE variable table".into());
         };
         let mut framer = Framer::new(vec![0u8; 1 << 16]);
         let mut out = [0u8; 4096];
@@ -144,7 +145,7 @@ impl Arm {
                 Err(e) if matches!(e.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut) => {
                     silent += 1;
                     if silent > 4 {
-                        return Err("the controller is silent".into());
+                        return Err("the controller has sent nothing for 2 s".into());
                     }
                 }
                 Err(e) => return Err(e.to_string()),
@@ -169,38 +170,40 @@ impl Arm {
     }
 }
 
-/// The controller's clock on the host's: a package can be late, never early, so that the least delay lately is the clocks' difference.
+/// Maps controller time to host time. A package can be late but never early, so the smallest recent delay is the offset of the
+/// clocks.
 ///
-/// Lately is 25 to 50 packages: longer than this program is ever kept from reading, and short enough to follow a controller whose
-/// clock lost time because it was itself kept from running.
+/// "Recent" is 25 to 50 packages: longer than any delay of this program's reads, and short enough to follow a mock whose clock
+/// lost time because the host stalled it.
 #[derive(Debug, Default)]
 struct ClockMap {
-    /// Least host minus controller, ns, of the packages being gathered and of those before.
-    least: [Option<f64>; 2],
-    gathered: u32,
+    /// Smallest host minus controller time, ns, in the present and in the previous window.
+    smallest: [Option<f64>; 2],
+    /// Packages in the present window.
+    packages: u32,
 }
 
 impl ClockMap {
-    /// Packages of one gathering.
-    const GATHER: u32 = 25;
+    /// Packages per window.
+    const WINDOW: u32 = 25;
 
-    /// When a package with this stamp (s) was made, given when it was read.
+    /// Host time, ns, at which a package with this time stamp (s) was created, given the time of reading.
     fn on_host(&mut self, stamp_s: f64, read_ns: u64) -> u64 {
         let found = read_ns as f64 - stamp_s * 1e9;
         if !found.is_finite() {
             return read_ns;
         }
-        if self.gathered == Self::GATHER {
-            self.least = [None, self.least[0]];
-            self.gathered = 0;
+        if self.packages == Self::WINDOW {
+            self.smallest = [None, self.smallest[0]];
+            self.packages = 0;
         }
-        self.gathered += 1;
-        self.least[0] = Some(self.least[0].map_or(found, |l| l.min(found)));
-        let offset = self.least.into_iter().flatten().fold(f64::INFINITY, f64::min);
-        // A second can only be a clock that was set back: what was gathered before means nothing then.
+        self.packages += 1;
+        self.smallest[0] = Some(self.smallest[0].map_or(found, |l| l.min(found)));
+        let offset = self.smallest.into_iter().flatten().fold(f64::INFINITY, f64::min);
+        // A delay above one second means that the controller's clock was set back: the windows are invalid.
         let delay = found - offset;
         if delay > 1e9 {
-            *self = Self { least: [Some(found), None], gathered: 1 };
+            *self = Self { smallest: [Some(found), None], packages: 1 };
             return read_ns;
         }
         read_ns.saturating_sub(delay as u64)
@@ -212,11 +215,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_late_package_keeps_the_time_it_was_made_at() {
+    fn a_late_package_is_assigned_its_creation_time() {
         let mut clock = ClockMap::default();
         for k in 0..1000u64 {
             let made = 5_000_000_000 + 2_000_000 * k;
-            // Up to 30 ms late now and then, as a batch; and 40 ms of its own time lost once.
+            // Batches up to 30 ms late, and a controller clock that loses 40 ms once.
             let made = if k < 500 { made } else { made + 40_000_000 };
             let late = if k % 50 < 15 { 2_000_000 * (15 - k % 50) } else { 50_000 };
             let at = clock.on_host(100.0 + 0.002 * k as f64, made + late);
@@ -224,12 +227,12 @@ mod tests {
                 assert!(at.abs_diff(made + 50_000) < 20_000, "{k}: {at} for {made}");
             }
         }
-        // A controller that was restarted counts from zero.
+        // A restarted controller counts from zero.
         assert_eq!(clock.on_host(0.0, 60_000_000_000), 60_000_000_000);
     }
 
     #[test]
-    fn joints_between_two_looks_are_in_proportion_and_outside_they_hold() {
+    fn joints_are_interpolated_between_samples_and_constant_outside() {
         let arm = Arm { history: Arc::default() };
         assert_eq!(arm.at(5), None);
         for k in 0..400u64 {

@@ -11,7 +11,7 @@ pub use faults::Fault;
 
 use crate::scenario::{Scenario, ScenarioError, WorldError};
 use clap::Parser;
-use control::Desk;
+use control::Console;
 use faults::Timed;
 use graspd_rt::geom::View;
 use graspd_shm::frame::TOPIC;
@@ -26,10 +26,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// Why the scene did not start or had to end.
+/// Why the scene did not start or had to stop.
 #[derive(Debug, thiserror::Error)]
 enum SceneError {
-    #[error("give --world DIR or --seed N")]
+    #[error("no world: give --world DIR or --seed N")]
     NoWorld,
     #[error(transparent)]
     World(#[from] WorldError),
@@ -39,9 +39,9 @@ enum SceneError {
     Names(#[from] NamesError),
     #[error(transparent)]
     Shm(#[from] ShmError),
-    #[error("--rate {0}: give 0.5 to 500 pairs a second")]
+    #[error("--rate {0}: expected 0.5 to 500 pairs per second")]
     Rate(f64),
-    #[error("--joints {0}: not a joint position (rad)")]
+    #[error("--joints: {0} rad is not a joint position")]
     Joint(f64),
     #[error("--fault {0}: {1}")]
     Fault(String, String),
@@ -54,7 +54,7 @@ enum SceneError {
 }
 
 impl SceneError {
-    /// Exit codes as the daemon's: 2 usage, 3 input, 4 link.
+    /// Exit code, with the daemon's meaning: 2 usage, 3 input, 4 link.
     fn code(&self) -> i32 {
         match self {
             Self::NoWorld | Self::Rate(_) | Self::Joint(_) | Self::Fault(..) => 2,
@@ -90,8 +90,8 @@ fn run(args: &Args) -> Result<(), SceneError> {
     if !(0.5..=500.0).contains(&args.rate) {
         return Err(SceneError::Rate(args.rate));
     }
-    // A camera keeps its rate on a busy host.
-    crate::host::prefer_this_process(crate::host::RENDERER);
+    // A camera keeps its rate on a loaded host.
+    crate::host::prefer_this_process(crate::host::RENDERER_NICE);
     let scenario = match (&args.world, args.seed) {
         (Some(dir), _) => Scenario::load(dir)?,
         (None, Some(seed)) => Scenario::from_seed(seed, &args.options())?,
@@ -117,7 +117,7 @@ fn run(args: &Args) -> Result<(), SceneError> {
         shared.add(Timed::parse(&value, now_ns()).map_err(bad)?);
     }
     let root = match &args.shm_root {
-        // Relative to where the program was started, as every other path of its options.
+        // Relative to the working directory, like all paths on the command line.
         Some(root) => std::path::absolute(root).unwrap_or_else(|_| root.clone()),
         None => Names::default_root(),
     };
@@ -125,9 +125,9 @@ fn run(args: &Args) -> Result<(), SceneError> {
     let names = Names::new(root, &prefix, &args.cell)?;
     let stop = stop_flag(args)?;
     let arm = Arm::fixed(q);
-    let desk = Desk { shared: Arc::clone(&shared), arm: arm.clone(), stop: Arc::clone(&stop) };
+    let console = Console { shared: Arc::clone(&shared), arm: arm.clone(), stop: Arc::clone(&stop) };
     let port = match args.control_port {
-        Some(p) => Some(desk.listen_on_port(p).map_err(|e| SceneError::Port(p, e))?),
+        Some(p) => Some(console.listen_on_port(p).map_err(|e| SceneError::Port(p, e))?),
         None => None,
     };
     if let Some(address) = &args.rtde {
@@ -148,12 +148,12 @@ fn run(args: &Args) -> Result<(), SceneError> {
         let mut out = std::io::stdout().lock();
         let _ = writeln!(out, "{line}").and_then(|()| out.flush());
         drop(out);
-        desk.listen_on_stdin(stdin_ends);
+        console.listen_on_stdin(stdin_ends);
     })?;
     Ok(())
 }
 
-/// A flag that is raised by SIGTERM, SIGINT, the end of the parent process or of the time allowed.
+/// A flag that is set by SIGTERM, SIGINT, the end of the parent process or the time limit.
 fn stop_flag(args: &Args) -> Result<Arc<AtomicBool>, SceneError> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
@@ -175,7 +175,7 @@ fn stop_flag(args: &Args) -> Result<Arc<AtomicBool>, SceneError> {
     Ok(stop)
 }
 
-/// Saves what both cameras see at the start.
+/// Writes the images of both cameras at the start.
 fn images(scenario: &Scenario, dir: &Path) -> Result<(), SceneError> {
     let bad = |e: String| SceneError::GreyImage(dir.to_owned(), e);
     std::fs::create_dir_all(dir).map_err(|e| bad(e.to_string()))?;

@@ -1,4 +1,4 @@
-//! Questions and faults as lines of JSON, on standard input and on a TCP port.
+//! Commands as lines of JSON, on standard input and on a TCP port.
 
 use super::faults::Timed;
 use super::joints::{Arm, now_ns};
@@ -11,18 +11,18 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// Longest line that is read.
-const LINE: u64 = 65_536;
+/// Longest line.
+const MAX_LINE_BYTES: u64 = 65_536;
 
-/// Answers lines; shared by all who ask.
+/// Answers command lines; shared by standard input and all connections.
 #[derive(Clone, Debug)]
-pub(super) struct Desk {
+pub(super) struct Console {
     pub(super) shared: Arc<Shared>,
     pub(super) arm: Arm,
     pub(super) stop: Arc<AtomicBool>,
 }
 
-impl Desk {
+impl Console {
     /// Answers one line.
     pub(super) fn answer(&self, line: &str) -> Value {
         let refuse = |e: String| json!({ "ok": false, "error": e });
@@ -48,18 +48,18 @@ impl Desk {
             return json!({ "ok": true });
         }
         match value.get("ask").and_then(Value::as_str) {
-            Some("truth") => self.truth(&value).unwrap_or_else(|| refuse("the arm was not seen yet".into())),
+            Some("truth") => self.truth(&value).unwrap_or_else(|| refuse("no joint positions received from the controller yet".into())),
             Some("status") => self.status(),
             Some("faults") => json!({ "ok": true, "faults": self.shared.faults() }),
             _ => refuse(
-                "give {\"ask\":\"truth\"}, {\"ask\":\"status\"}, {\"ask\":\"faults\"}, {\"fault\":NAME,..}, {\"clear\":true} or \
+                "expected {\"ask\":\"truth\"}, {\"ask\":\"status\"}, {\"ask\":\"faults\"}, {\"fault\":NAME,..}, {\"clear\":true} or \
                  {\"quit\":true}"
                     .into(),
             ),
         }
     }
 
-    /// How far the gripper really is from grasp and pre-grasp.
+    /// True misalignment of the gripper with grasp and pre-grasp.
     fn truth(&self, question: &Value) -> Option<Value> {
         let scenario = self.shared.scenario()?;
         let sample = self.arm.newest()?;
@@ -88,47 +88,47 @@ impl Desk {
         s
     }
 
-    /// Reads standard input on a thread of its own; with `end` its end is the program's.
+    /// Reads standard input on a separate thread; with `end` the program stops when it is closed.
     pub(super) fn listen_on_stdin(&self, end: bool) {
-        let desk = self.clone();
+        let console = self.clone();
         std::thread::spawn(move || {
             let mut input = BufReader::new(std::io::stdin());
             let mut line = String::new();
             loop {
                 line.clear();
-                match input.by_ref().take(LINE).read_line(&mut line) {
+                match input.by_ref().take(MAX_LINE_BYTES).read_line(&mut line) {
                     Ok(n) if n > 0 => {
                         if !line.trim().is_empty() {
                             let mut out = std::io::stdout().lock();
-                            let _ = writeln!(out, "{}", desk.answer(&line)).and_then(|()| out.flush());
+                            let _ = writeln!(out, "{}", console.answer(&line)).and_then(|()| out.flush());
                         }
                     }
                     _ => break,
                 }
             }
             if end {
-                desk.stop.store(true, Ordering::Relaxed);
+                console.stop.store(true, Ordering::Relaxed);
             }
         });
     }
 
-    /// Serves one asker at a time on a loopback port; the port.
+    /// Listens on a loopback port with one thread per connection. Returns the port number.
     pub(super) fn listen_on_port(&self, port: u16) -> std::io::Result<u16> {
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port))?;
         let port = listener.local_addr()?.port();
-        let desk = self.clone();
+        let console = self.clone();
         std::thread::spawn(move || {
             for stream in listener.incoming() {
                 let Ok(mut stream) = stream else { continue };
                 let _ = stream.set_read_timeout(Some(Duration::from_secs(60)));
                 let _ = stream.set_nodelay(true);
                 let Ok(copy) = stream.try_clone() else { continue };
-                let desk = desk.clone();
+                let console = console.clone();
                 std::thread::spawn(move || {
                     let mut input = BufReader::new(copy);
                     let mut line = String::new();
-                    while input.by_ref().take(LINE).read_line(&mut line).is_ok_and(|n| n > 0) {
-                        if writeln!(stream, "{}", desk.answer(&line)).is_err() {
+                    while input.by_ref().take(MAX_LINE_BYTES).read_line(&mut line).is_ok_and(|n| n > 0) {
+                        if writeln!(stream, "{}", console.answer(&line)).is_err() {
                             break;
                         }
                         line.clear();

@@ -1,95 +1,95 @@
-//! Camera and shared-memory faults on command (fault-catalogue numbers in brackets), each for a while or until cleared.
+//! Faults of the cameras and of the shared memory, each active for a time or until cleared.
 
 use graspd_shm::frame::{StereoHeader, flags};
 use serde::{Deserialize, Serialize};
 
-/// One fault, as a line of JSON names it: `{"fault":"skew","ms":8,"after_s":2,"for_s":1}`.
+/// One fault. As a line of JSON: `{"fault":"skew","ms":8,"after_s":2,"for_s":1}`. `eye` selects a camera: 0 left, 1 right.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "fault", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Fault {
-    /// Same image again and again while stamps and sequence go on (C03); `eye` 0 left, 1 right, both without.
+    /// Repeats the same image while time stamps and sequence numbers continue.
     Freeze {
-        /// Which eye.
+        /// Camera; both if omitted.
         #[serde(default)]
         eye: Option<usize>,
     },
-    /// One eye's image and stamp stand still (C01); without `eye` nothing is published at all (C02).
+    /// Repeats image and time stamp of one camera; without `eye` nothing is published.
     Stop {
-        /// Which eye.
+        /// Camera; both if omitted.
         #[serde(default)]
         eye: Option<usize>,
     },
-    /// The sequence number repeats (C04).
+    /// Repeats the sequence number.
     RepeatSequence {},
-    /// The sequence number jumps back by `n` (C04).
+    /// Sets the sequence number back.
     BackSequence {
-        /// How far.
+        /// By how much.
         n: u64,
     },
-    /// Of every `every` pairs one is lost before publishing (C05).
+    /// Loses one of every `every` pairs before publishing.
     Drop {
         /// Period of the loss.
         every: u64,
     },
-    /// The right eye is exposed earlier by `ms`, and says so (C06).
+    /// Exposes the right camera earlier by `ms`, with a matching time stamp.
     Skew {
         /// Milliseconds.
         ms: f64,
     },
-    /// Left and right images change places; with `ids` the camera ids as well (C07).
+    /// Exchanges left and right images, with `ids` also the camera ids.
     Swap {
-        /// Whether the ids go with the images.
+        /// Whether the camera ids are exchanged.
         #[serde(default)]
         ids: bool,
     },
-    /// A header field lies [C08, H01, H02, H03]: `width`, `height`, `stride`, `pixel_format`, `magic`, `layout_version`,
+    /// Writes a wrong value into a header field: `width`, `height`, `stride`, `pixel_format`, `magic`, `layout_version`,
     /// `header_size`, `offset`, `size`, `sequence_end`, `camera_id`, `calibration_id`, `flags`.
     Header {
         /// Field.
         field: String,
-        /// Its value; for `offset`, `size` and `camera_id` the right eye's.
+        /// Its value; for `offset`, `size` and `camera_id` that of the right camera.
         value: u64,
     },
-    /// Part of an image is missing; flagged unless `silent` (C09).
+    /// A part of an image is missing; flagged unless `silent`.
     Incomplete {
         /// Which eye.
         #[serde(default)]
         eye: usize,
-        /// Do not flag it.
+        /// Whether the flag is omitted.
         #[serde(default)]
         silent: bool,
     },
-    /// Capture stamps are off by `ms`, positive into the future (C10); `drift_ppm` lets them run away (C11).
+    /// Capture time stamps have an offset `ms` (positive: in the future) and a drift.
     Stamp {
-        /// Constant part, milliseconds.
+        /// Offset, milliseconds.
         #[serde(default)]
         ms: f64,
-        /// Growing part, parts per million.
+        /// Drift, parts per million.
         #[serde(default)]
         drift_ppm: f64,
     },
-    /// Greys are multiplied: 0 is black, 1 as it was, 10 saturated (C12). `period_s` lets the exposure hunt.
+    /// Multiplies the grey values: 0 is black, 1 unchanged, 10 saturated. With `period_s` the exposure oscillates.
     Gain {
         /// Factor.
         factor: f64,
-        /// Period of a sine between 1 and `factor`; 0 for steady.
+        /// Period of an oscillation between 1 and `factor`, s; 0 for a constant factor.
         #[serde(default)]
         period_s: f64,
     },
-    /// Fog: contrast shrinks towards `grey` by `share` (C12).
+    /// Fog: contrast is reduced towards `grey` by the fraction `share`.
     Fog {
-        /// Share of the fog, 0 to 1.
+        /// Fraction of the fog, 0 to 1.
         share: f64,
-        /// Its grey.
+        /// Its grey value.
         #[serde(default = "mid_grey")]
         grey: f64,
     },
-    /// Defocus: a box blur of half width `px` (C13).
+    /// Defocus: a box blur of half width `px`.
     Blur {
         /// Half width, pixels.
         px: usize,
     },
-    /// A camera is knocked: moved along x by `mm` and turned about y by `deg` (C14). Takes a second to show.
+    /// Displaces a camera: along x by `mm` and about y by `deg`. Takes effect after about a second.
     KnockCamera {
         /// Which eye.
         #[serde(default)]
@@ -101,33 +101,33 @@ pub enum Fault {
         #[serde(default)]
         deg: f64,
     },
-    /// The valve is moved by `mm` along its x axis after the plan was made (G07). Takes a second to show.
+    /// Moves the valve by `mm` along its x axis. Takes effect after about a second.
     MoveObject {
         /// Millimetres.
         mm: f64,
     },
-    /// Another rate (C16).
+    /// Another rate.
     Rate {
-        /// Pairs a second.
+        /// Pairs per second.
         hz: f64,
     },
-    /// A mark is painted over in both views [M01, M02]; several by several faults.
+    /// Paints over a mark in both images; several marks need several faults.
     OccludeMark {
-        /// Which mark, from 0.
+        /// Mark, from 0.
         mark: usize,
     },
-    /// Everything of the gripper is hidden (M02).
+    /// Hides the whole gripper.
     HideGripper {},
-    /// Two marks change places in the images: each window shows the other's surroundings (M03).
+    /// Exchanges the windows around two marks in the images.
     SwapMarks {
-        /// One.
+        /// First mark.
         a: usize,
-        /// The other.
+        /// Second mark.
         b: usize,
     },
-    /// A disc that is no mark, `du`, `dv` pixels from a mark (M04).
+    /// Draws a disc, which is not a mark, at `du`, `dv` pixels from a mark.
     Blob {
-        /// Which mark.
+        /// Mark.
         #[serde(default)]
         mark: usize,
         /// Pixels to the right.
@@ -137,16 +137,16 @@ pub enum Fault {
         /// Radius, pixels.
         #[serde(default = "blob_radius")]
         radius: f64,
-        /// Grey.
+        /// Grey value.
         #[serde(default)]
         grey: u8,
     },
-    /// The gripper appears elsewhere, by `mm` along its x axis (M05).
+    /// Draws the gripper displaced by `mm` along its x axis.
     Teleport {
         /// Millimetres.
         mm: f64,
     },
-    /// One view is shifted by whole pixels (M08).
+    /// Shifts one image by whole pixels.
     Shift {
         /// Which eye.
         #[serde(default)]
@@ -156,11 +156,11 @@ pub enum Fault {
         /// Pixels down.
         dv: i64,
     },
-    /// The gripper's image stands still while the arm moves; noise goes on (M09).
+    /// Draws the gripper at a constant pose while the arm moves; the noise changes.
     HoldPose {},
-    /// White noise instead of images (M07).
+    /// White noise instead of images.
     WhiteNoise {},
-    /// A second publisher sends pairs of its own (H06).
+    /// A second publisher sends on the same topic.
     SecondPublisher {},
 }
 
@@ -172,22 +172,24 @@ fn blob_radius() -> f64 {
     6.0
 }
 
-/// A fault with its time.
+/// A fault and the time for which it is active.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Timed {
     pub(super) fault: Fault,
-    /// From and until, CLOCK_MONOTONIC nanoseconds.
+    /// Begin and end, CLOCK_MONOTONIC nanoseconds.
     pub(super) from_ns: u64,
     pub(super) until_ns: u64,
 }
 
 impl Timed {
-    /// Reads a fault's JSON object; `after_s` and `for_s` are its own keys for when and how long.
+    /// Parses a fault. The keys `after_s` and `for_s` are its delay and duration in seconds.
     pub(super) fn parse(value: &serde_json::Value, now_ns: u64) -> Result<Self, String> {
-        let mut map = value.as_object().cloned().ok_or("a fault is a JSON object")?;
+        let mut map = value.as_object().cloned().ok_or("expected a JSON object")?;
         let mut seconds = |key: &str, default: f64| match map.remove(key) {
             None => Ok(default),
-            Some(v) => v.as_f64().filter(|s| *s >= 0.0 && *s < 1e9).ok_or(format!("`{key}`: give seconds, at least 0")),
+            Some(v) => {
+                v.as_f64().filter(|s| *s >= 0.0 && *s < 1e9).ok_or(format!("`{key}`: expected seconds, at least 0"))
+            }
         };
         let (after, length) = (seconds("after_s", 0.0)?, seconds("for_s", 1e9)?);
         let fault: Fault = serde_json::from_value(serde_json::Value::Object(map)).map_err(|e| e.to_string())?;
@@ -201,10 +203,10 @@ impl Timed {
 }
 
 impl Fault {
-    /// Changes a finished image (eye 0 or 1) of `w` times `h` bytes.
-    pub(super) fn spoil(&self, eye: usize, image: &mut [u8], w: usize, h: usize, t_s: f64, key: u64) {
+    /// Applies the fault to a rendered image of `w` times `h` bytes of camera 0 or 1.
+    pub(super) fn degrade_image(&self, camera: usize, image: &mut [u8], w: usize, h: usize, t_s: f64, key: u64) {
         match self {
-            Fault::Incomplete { eye: e, .. } if *e == eye => {
+            Fault::Incomplete { eye, .. } if *eye == camera => {
                 for row in image.chunks_exact_mut(w).skip(h / 2).step_by(3) {
                     row.fill(0);
                 }
@@ -219,7 +221,7 @@ impl Fault {
             }
             Fault::Fog { share, grey } => map(image, |g| g + share.clamp(0.0, 1.0) * (grey - g)),
             Fault::Blur { px } => box_blur(image, w, h, (*px).min(40)),
-            Fault::Shift { eye: e, du, dv } if *e == eye => shift(image, w, h, *du, *dv),
+            Fault::Shift { eye, du, dv } if *eye == camera => shift(image, w, h, *du, *dv),
             Fault::WhiteNoise {} => {
                 let mut k = key | 1;
                 for p in image {
@@ -233,8 +235,8 @@ impl Fault {
         }
     }
 
-    /// Changes a header.
-    pub(super) fn lie(&self, h: &mut StereoHeader, t_s: f64) {
+    /// Applies the fault to a frame header.
+    pub(super) fn corrupt_header(&self, h: &mut StereoHeader, t_s: f64) {
         match self {
             Fault::RepeatSequence {} => (h.sequence, h.sequence_end) = (1, 1),
             Fault::BackSequence { n } => {
@@ -310,7 +312,7 @@ fn shift(image: &mut [u8], w: usize, h: usize, du: i64, dv: i64) {
     }
 }
 
-/// Paints a disc with soft edges.
+/// Paints an antialiased disc.
 pub(super) fn disc(image: &mut [u8], w: usize, h: usize, centre: (f64, f64), radius: f64, grey: u8) {
     let reach = |c: f64, n: usize| {
         (
@@ -333,7 +335,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn faults_are_read_from_json_with_their_time() {
+    fn faults_are_parsed_from_json_with_their_times() {
         let t = Timed::parse(&serde_json::json!({"fault":"skew","ms":8,"after_s":2,"for_s":1}), 1_000_000_000).unwrap();
         assert_eq!(t.fault, Fault::Skew { ms: 8.0 });
         assert!(!t.active(2_900_000_000) && t.active(3_100_000_000) && !t.active(4_100_000_000));
@@ -349,20 +351,20 @@ mod tests {
     }
 
     #[test]
-    fn images_are_spoilt_as_the_fault_says() {
+    fn image_faults_change_the_pixels_they_name() {
         let (w, h) = (40, 30);
         let fresh = || (0..w * h).map(|i| (i % 200) as u8).collect::<Vec<u8>>();
         let mut p = fresh();
-        Fault::Gain { factor: 0.0, period_s: 0.0 }.spoil(0, &mut p, w, h, 0.0, 1);
+        Fault::Gain { factor: 0.0, period_s: 0.0 }.degrade_image(0, &mut p, w, h, 0.0, 1);
         assert!(p.iter().all(|g| *g == 0));
         let mut p = fresh();
-        Fault::Shift { eye: 1, du: 3, dv: -2 }.spoil(1, &mut p, w, h, 0.0, 1);
+        Fault::Shift { eye: 1, du: 3, dv: -2 }.degrade_image(1, &mut p, w, h, 0.0, 1);
         assert_eq!(p[10 * w + 10], fresh()[12 * w + 7]);
         let mut p = fresh();
-        Fault::Shift { eye: 1, du: 3, dv: -2 }.spoil(0, &mut p, w, h, 0.0, 1);
+        Fault::Shift { eye: 1, du: 3, dv: -2 }.degrade_image(0, &mut p, w, h, 0.0, 1);
         assert_eq!(p, fresh());
         let mut p = vec![100; w * h];
-        Fault::Blur { px: 3 }.spoil(0, &mut p, w, h, 0.0, 1);
+        Fault::Blur { px: 3 }.degrade_image(0, &mut p, w, h, 0.0, 1);
         assert!(p.iter().all(|g| *g == 100));
         disc(&mut p, w, h, (20.0, 15.0), 4.0, 0);
         assert_eq!((p[15 * w + 20], p[15 * w + 30]), (0, 100));
