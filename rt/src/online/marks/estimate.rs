@@ -1,0 +1,355 @@
+//! A mark's shift from its predicted outline, by the grey values about its rim.
+//!
+//! [`track`] is for a mark whose shape and blur are known: two looks at the pixels, six unknowns. [`settle`] fits blur and shape
+//! as well, and leaves out sectors of the rim that do not fit. Both end with a judgement: whether what they leave is what the
+//! flat pixels have as noise.
+
+use super::Outline;
+use super::band::{Band, SECTORS};
+use super::coverage::{MAX_VARIANCE, Smear};
+use super::grey::{Equations, Model, PLAIN, WHOLE, equations, residuals};
+use crate::image::ImageView;
+use crate::math;
+use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
+
+/// Room for the shift beyond the pixels that are partly covered, px.
+const ROOM: f64 = 0.3;
+/// Largest shift that [`track`] follows, px: beyond, too many pixels of the band have no derivative.
+const TRACK_RANGE: f64 = 0.6;
+/// A step shorter than this leaves less than 1 % of itself, px (docs/TRACKER.md: one of 0.3 px leaves 0.016 px).
+const SETTLED: f64 = 0.05;
+/// Misfit of the rim, in pixels of its position, below which a model explains a mark: an eighth of the noise of one rim pixel
+/// at a contrast of a hundred grey values and four of noise.
+pub(crate) const EXPLAINED_PX: f64 = 0.03;
+/// How far the shape may be from the prediction before the data tell (one sigma of a relative stretch).
+const SHAPE_SIGMA: f64 = 0.05;
+/// How far the blur's variance may be from what is expected before the data tell, px² (one sigma).
+const BLUR_SIGMA: f64 = 1.0;
+/// A sector whose mean square is this many times the middle one's is hidden by something: by chance, ten pixels are once in 10^6.
+const SECTOR_FACTOR: f64 = 5.0;
+/// Misfit that no sector is dropped for, pixels of the rim's position.
+const SECTOR_FLOOR_PX: f64 = 0.05;
+/// Looks at the pixels in [`settle`] before sectors are judged.
+const LOOKS: usize = 5;
+
+/// Sectors of a rim that something hides.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Hidden(u16);
+
+impl Hidden {
+    pub(crate) fn count(self) -> usize {
+        self.0.count_ones() as usize
+    }
+
+    fn add(&mut self, k: usize, band: &mut Band) {
+        self.0 |= 1 << k;
+        self.apply(band);
+    }
+
+    fn apply(self, band: &mut Band) {
+        for k in (0..SECTORS).filter(|k| self.0 >> k & 1 == 1) {
+            band.rim.drop_sector(k);
+            band.flat[0].drop_sector(k);
+            band.flat[1].drop_sector(k);
+        }
+    }
+}
+
+/// A mark's fit.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Estimate {
+    /// From the predicted centre, px.
+    pub(crate) shift: Vector2<f64>,
+    /// Of the shift, px².
+    pub(crate) covariance: Matrix2<f64>,
+    /// Blur, px².
+    pub(crate) variance: f64,
+    /// Symmetric stretch (xx, xy, yy) of the outline.
+    pub(crate) stretch: [f64; 3],
+    /// Grey difference inside minus outside.
+    pub(crate) step: f64,
+    /// What the rim is off by beyond noise, as pixels of its position.
+    pub(crate) misfit_px: f64,
+    /// Sectors that were left out.
+    pub(crate) hidden: Hidden,
+    /// Share of the rim that counts.
+    pub(crate) share: f64,
+    /// Standard deviation of the flat pixels, grey values.
+    pub(crate) noise: f64,
+}
+
+impl Estimate {
+    /// Whether noise explains what is left.
+    pub(crate) fn explains(&self, limit_px: f64) -> bool {
+        self.misfit_px <= limit_px && self.noise <= 0.25 * math::fabs(self.step)
+    }
+}
+
+/// Levels of the flat pixels, or of the rim's own where a mark is too small to have any.
+fn begin(band: &Band, smear: Smear) -> Option<Model> {
+    let mut level = [0.0_f32; 2];
+    for (l, p) in level.iter_mut().zip(&band.flat) {
+        let (mut sum, mut n) = (0.0, 0.0);
+        for (g, w) in p.grey.iter().zip(&p.weight).take(p.len) {
+            (sum, n) = (sum + w * g, n + w);
+        }
+        *l = sum / n;
+    }
+    if band.flat[1].len == 0 || band.flat[0].len == 0 {
+        let deep = |sign: f32| {
+            let mut best = (0.0_f32, 0.0_f32);
+            for (d, g) in band.depth.iter().zip(&band.rim.grey).take(band.rim.len) {
+                if sign * d > 0.6 {
+                    best = (best.0 + g, best.1 + 1.0);
+                }
+            }
+            best.0 / best.1
+        };
+        level = [deep(-1.0), deep(1.0)];
+    }
+    level.iter().all(|l| l.is_finite()).then_some(Model {
+        shift: [0.0; 2],
+        level,
+        slope: [0.0; 2],
+        smear,
+        stretch: [0.0; 3],
+    })
+}
+
+/// Solves with a factor at hand; `None` where the pixels fix nothing.
+fn solve<const N: usize>(
+    matrix: SMatrix<f64, N, N>,
+    right: &SVector<f64, N>,
+) -> Option<(SVector<f64, N>, Matrix2<f64>)> {
+    let factor = matrix.cholesky()?;
+    let p = factor.solve(right);
+    let mut unit = SMatrix::<f64, N, 2>::zeros();
+    (unit[(0, 0)], unit[(1, 1)]) = (1.0, 1.0);
+    factor.solve_mut(&mut unit);
+    let c = Matrix2::new(unit[(0, 0)], unit[(0, 1)], unit[(1, 0)], unit[(1, 1)]);
+    p.iter().chain(c.iter()).all(|v| v.is_finite()).then_some((p, c))
+}
+
+/// The shift of a mark whose shape and blur are as predicted, about `start`.
+///
+/// `None` when the shift is out of range or the pixels fix nothing. `sign` is +1 for a dark mark, -1 for a light one.
+pub(crate) fn track(
+    band: &mut Band,
+    image: &ImageView<'_>,
+    outline: &Outline,
+    start: Vector2<f64>,
+    smear: Smear,
+    sign: f64,
+) -> Option<Estimate> {
+    band.gather(image, outline, start, f64::from(smear.reach()) + ROOM);
+    let mut m = begin(band, smear)?;
+    if f64::from(m.step()) * sign >= 0.0 {
+        return None;
+    }
+    let mut hidden = Hidden::default();
+    loop {
+        let mut e: Equations<PLAIN> = equations(band, &m);
+        let factor = e.matrix.cholesky()?;
+        let mut last = factor.solve(&e.right);
+        m.add(last.as_slice());
+        for _ in 0..3 {
+            if !(shift_length(&m) <= TRACK_RANGE) {
+                return None;
+            }
+            residuals(band, &m, &mut e);
+            let step = factor.solve(&e.right);
+            m.add(step.as_slice());
+            let before = math::sqrt(last[0] * last[0] + last[1] * last[1]);
+            last = step;
+            if before < SETTLED || math::sqrt(step[0] * step[0] + step[1] * step[1]) < 0.02 * SETTLED {
+                break;
+            }
+        }
+        let noise = flat_noise(band);
+        match worst_sector(band, &m, noise) {
+            Some(k) if hidden.count() < SECTORS / 2 => hidden.add(k, band),
+            worst => {
+                let (_, c) = solve(e.matrix, &e.right)?;
+                let mut estimate = judged(band, &m, &e, c, start, noise, [0.0; 3]);
+                estimate.hidden = hidden;
+                if worst.is_some() {
+                    estimate.misfit_px = f64::INFINITY;
+                }
+                return Some(estimate);
+            }
+        }
+    }
+}
+
+fn shift_length(m: &Model) -> f64 {
+    let [x, y] = m.shift.map(f64::from);
+    math::sqrt(x * x + y * y)
+}
+
+/// The middle sector's mean square, grey values squared: the noise, whatever hides less than half of the sectors.
+fn flat_noise(band: &Band) -> f64 {
+    let mut all: heapless::Vec<f64, SECTORS> = heapless::Vec::new();
+    for k in 0..SECTORS {
+        let (a, b) = (band.flat[0].squares(k), band.flat[1].squares(k));
+        let n = a.0 + b.0;
+        if n >= 4.0 {
+            let _ = all.push(f64::from((a.1 + b.1) / n));
+        }
+    }
+    super::edge_fit::middle(&mut all)
+}
+
+/// A sector of the rim that does not fit: the worst, if any is beyond chance.
+fn worst_sector(band: &Band, m: &Model, noise: f64) -> Option<usize> {
+    let floor = math::sq(SECTOR_FLOOR_PX * f64::from(m.step()));
+    let mut all: heapless::Vec<f64, SECTORS> = heapless::Vec::new();
+    let mut worst: Option<(usize, f64)> = None;
+    for k in 0..SECTORS {
+        let (n, squares) = band.rim.squares(k);
+        let (a, b) = (band.flat[0].squares(k), band.flat[1].squares(k));
+        let pixels = n + a.0 + b.0;
+        if pixels < 1.0 {
+            continue;
+        }
+        let mean = f64::from((squares + a.1 + b.1) / pixels);
+        let _ = all.push(mean);
+        if worst.is_none_or(|w| mean > w.1) {
+            worst = Some((k, mean));
+        }
+    }
+    let (k, mean) = worst?;
+    let middle = super::edge_fit::middle(&mut all).max(noise);
+    (mean > SECTOR_FACTOR * middle + floor).then_some(k)
+}
+
+fn judged<const N: usize>(
+    band: &Band,
+    m: &Model,
+    e: &Equations<N>,
+    unit: Matrix2<f64>,
+    start: Vector2<f64>,
+    noise: f64,
+    stretch: [f64; 3],
+) -> Estimate {
+    let step = f64::from(m.step());
+    // The noise as the shift sees it: each pixel's residual by its squared derivative. The rim's length in pixels is about the
+    // number of independent ones; two more are taken off because it is the inverse that has to be unbiased.
+    let pixels = e.weights / math::sq(step).max(1e-9);
+    let freedom = (pixels - (PLAIN - 2) as f64).max(2.0);
+    let rim = e.weighted_squares / e.weights.max(1e-12) * (pixels / freedom);
+    let allowance = noise * (1.0 + 5.0 * math::sqrt(2.0 / freedom));
+    let misfit_px = math::sqrt((rim - allowance).max(0.0)) / math::fabs(step).max(1e-9);
+    let kept: f32 = band.rim.weight[..band.rim.len].iter().sum();
+    Estimate {
+        shift: start + Vector2::new(f64::from(m.shift[0]), f64::from(m.shift[1])),
+        covariance: unit * rim,
+        variance: f64::from(m.smear.variance),
+        stretch,
+        step,
+        misfit_px,
+        hidden: Hidden::default(),
+        share: f64::from(kept) / band.wanted.max(1) as f64,
+        noise: math::sqrt(noise),
+    }
+}
+
+/// The shift with blur and shape fitted too, about an outline of roughly the right place, without sectors that do not fit.
+///
+/// `hidden` are sectors known not to. Work is bounded: [`LOOKS`] looks, and two more for each of at most half of the sectors.
+pub(crate) fn settle(
+    band: &mut Band,
+    image: &ImageView<'_>,
+    outline: &Outline,
+    (start, hidden): (Vector2<f64>, Hidden),
+    smear: Smear,
+    sign: f64,
+) -> Option<Estimate> {
+    let (mut outline, mut start, mut hidden) = (*outline, start, hidden);
+    let mut total = [0.0_f64; 3];
+    let expected = f64::from(smear.variance);
+    band.gather(image, &outline, start, f64::from(smear.reach()) + 2.0 * ROOM);
+    hidden.apply(band);
+    let mut m = begin(band, smear)?;
+    let mut left = LOOKS;
+    let mut noise = 4.0;
+    loop {
+        let mut e: Equations<WHOLE> = equations(band, &m);
+        let matrix = with_priors(&mut e, &m, expected, &total, noise);
+        let (mut p, unit) = solve(matrix, &e.right)?;
+        limit(&mut p, &m);
+        m.add(p.as_slice());
+        left = left.saturating_sub(1);
+        let moved = math::sqrt(p[0] * p[0] + p[1] * p[1]);
+        let bent = p.fixed_rows::<3>(7).norm();
+        let settled = moved < SETTLED && bent < 0.01 && math::fabs(p[6]) < 0.1 * (f64::from(m.smear.variance) + 0.1);
+        if !settled && left > 0 {
+            // The band follows.
+            let shape = m.stretch.map(f64::from);
+            for (t, s) in total.iter_mut().zip(shape) {
+                *t += s;
+            }
+            start += Vector2::new(f64::from(m.shift[0]), f64::from(m.shift[1]));
+            outline = outline.stretched(&shape)?;
+            band.gather(image, &outline, start, f64::from(m.smear.reach()) + ROOM);
+            hidden.apply(band);
+            (m.shift, m.stretch) = ([0.0; 2], [0.0; 3]);
+            continue;
+        }
+        residuals(band, &m, &mut e);
+        let flat = flat_noise(band);
+        noise = flat.max(0.1);
+        match worst_sector(band, &m, flat) {
+            Some(k) if hidden.count() < SECTORS / 2 => {
+                hidden.add(k, band);
+                left = 2;
+            }
+            worst => {
+                if f64::from(m.step()) * sign >= 0.0 {
+                    return None;
+                }
+                for (t, s) in total.iter_mut().zip(m.stretch) {
+                    *t += f64::from(s);
+                }
+                let mut estimate = judged(band, &m, &e, unit, start, flat, total);
+                estimate.hidden = hidden;
+                if worst.is_some() {
+                    estimate.misfit_px = f64::INFINITY;
+                }
+                return Some(estimate);
+            }
+        }
+    }
+}
+
+/// The normal matrix with what is expected of blur and shape, at the given noise (grey values squared).
+fn with_priors(
+    e: &mut Equations<WHOLE>,
+    m: &Model,
+    expected: f64,
+    total: &[f64; 3],
+    noise: f64,
+) -> SMatrix<f64, WHOLE, WHOLE> {
+    let mut matrix = e.matrix;
+    let blur = noise / math::sq(BLUR_SIGMA);
+    matrix[(6, 6)] += blur;
+    e.right[6] += blur * (expected - f64::from(m.smear.variance));
+    let shape = noise / math::sq(SHAPE_SIGMA);
+    for (k, t) in total.iter().enumerate() {
+        matrix[(7 + k, 7 + k)] += shape;
+        e.right[7 + k] -= shape * (t + f64::from(m.stretch[k]));
+    }
+    matrix
+}
+
+/// Keeps a step where the model is linear.
+fn limit(p: &mut SVector<f64, WHOLE>, m: &Model) {
+    let v = f64::from(m.smear.variance);
+    let moved = math::sqrt(p[0] * p[0] + p[1] * p[1]);
+    let bent = p.fixed_rows::<3>(7).norm();
+    let share = (1.0 / moved).min(0.1 / bent).min(1.0);
+    for k in [0, 1, 7, 8, 9] {
+        p[k] *= share;
+    }
+    let next = (v + p[6]).clamp(0.4 * v - 0.02, 2.0 * v + 0.15).clamp(0.0, f64::from(MAX_VARIANCE));
+    p[6] = next - v;
+}
