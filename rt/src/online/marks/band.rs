@@ -71,29 +71,28 @@ impl<const N: usize> Pixels<N> {
         }
     }
 
-    /// Leaves a sector out.
-    pub(crate) fn drop_sector(&mut self, k: usize) {
+    /// Takes a sector in (1) or leaves it out (0).
+    pub(crate) fn weigh_sector(&mut self, k: usize, weight: f32) {
         let (from, to) = (self.sector[k], self.sector[k + 1]);
-        self.weight[from..to].fill(0.0);
+        self.weight[from..to].fill(weight);
     }
 
-    /// Pixels of a sector that count, and their squared residuals.
+    /// Pixels of a sector, and the sum of their squared residuals.
     pub(crate) fn squares(&self, k: usize) -> (f32, f32) {
         let (from, to) = (self.sector[k], self.sector[k + 1]);
-        let mut sum = (0.0, 0.0);
-        for (w, r) in self.weight[from..to].iter().zip(&self.residual[from..to]) {
-            sum = (sum.0 + w, sum.1 + w * r * r);
-        }
-        sum
+        ((to - from) as f32, self.residual[from..to].iter().map(|r| r * r).sum())
     }
 }
+
+/// Flat pixels of one side.
+pub(crate) type Flat = Pixels<MAX_FLAT>;
 
 /// The pixels of one mark, and where they lie against its predicted rim.
 #[derive(Clone, Debug)]
 pub(crate) struct Band {
     pub(crate) rim: Pixels<MAX_RIM>,
     /// Flat pixels outside and inside.
-    pub(crate) flat: [Pixels<MAX_FLAT>; 2],
+    pub(crate) flat: [Flat; 2],
     /// Distance from the rim, positive inside, px.
     pub(crate) depth: [f32; MAX_RIM],
     /// Outward unit normal of the rim.

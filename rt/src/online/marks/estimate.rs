@@ -5,7 +5,7 @@
 //! flat pixels have as noise.
 
 use super::Outline;
-use super::band::{Band, SECTORS};
+use super::band::{Band, Flat, SECTORS};
 use super::coverage::{MAX_VARIANCE, Smear};
 use super::grey::{Equations, Model, PLAIN, WHOLE, equations, residuals};
 use crate::image::ImageView;
@@ -29,6 +29,16 @@ const BLUR_SIGMA: f64 = 1.0;
 const SECTOR_FACTOR: f64 = 5.0;
 /// Misfit that no sector is dropped for, pixels of the rim's position.
 const SECTOR_FLOOR_PX: f64 = 0.05;
+/// The same where shape and blur are held: a wrong shape is not something that hides the rim.
+const HIDDEN_PX: f64 = 0.15;
+/// Flat pixels this many times as noisy as the rim are not flat: by chance, a hundred of them are once in 10^9.
+const ROUGH_FACTOR: f64 = 2.5;
+/// Roughness that does no harm, as a share of the step.
+const ROUGH_FLOOR: f64 = 0.01;
+/// A sector whose flat pixels are this share of the step off the others' level is hidden.
+const FAR_SHARE: f32 = 0.25;
+/// Changes of what is left out, at most: up to two thirds of the sectors.
+const ROUNDS: usize = 2 * SECTORS / 3;
 /// Looks at the pixels in [`settle`] before sectors are judged.
 const LOOKS: usize = 5;
 
@@ -37,20 +47,16 @@ const LOOKS: usize = 5;
 pub(crate) struct Hidden(u16);
 
 impl Hidden {
-    pub(crate) fn count(self) -> usize {
-        self.0.count_ones() as usize
-    }
-
-    fn add(&mut self, k: usize, band: &mut Band) {
-        self.0 |= 1 << k;
-        self.apply(band);
+    fn has(self, k: usize) -> bool {
+        self.0 >> k & 1 == 1
     }
 
     fn apply(self, band: &mut Band) {
-        for k in (0..SECTORS).filter(|k| self.0 >> k & 1 == 1) {
-            band.rim.drop_sector(k);
-            band.flat[0].drop_sector(k);
-            band.flat[1].drop_sector(k);
+        for k in 0..SECTORS {
+            let weight = if self.has(k) { 0.0 } else { 1.0 };
+            band.rim.weigh_sector(k, weight);
+            band.flat[0].weigh_sector(k, weight);
+            band.flat[1].weigh_sector(k, weight);
         }
     }
 }
@@ -70,6 +76,8 @@ pub(crate) struct Estimate {
     pub(crate) step: f64,
     /// What the rim is off by beyond noise, as pixels of its position.
     pub(crate) misfit_px: f64,
+    /// Mean square of the rim's residuals as the shift sees them, grey values squared.
+    pub(crate) rim_noise: f64,
     /// Sectors that were left out.
     pub(crate) hidden: Hidden,
     /// Share of the rim that counts.
@@ -85,35 +93,55 @@ impl Estimate {
     }
 }
 
-/// Levels of the flat pixels, or of the rim's own where a mark is too small to have any.
+/// A model with the mean levels of the flat pixels, or those of the rim's own where a mark is too small to have any.
 fn begin(band: &Band, smear: Smear) -> Option<Model> {
-    let mut level = [0.0_f32; 2];
-    for (l, p) in level.iter_mut().zip(&band.flat) {
-        let (mut sum, mut n) = (0.0, 0.0);
-        for (g, w) in p.grey.iter().zip(&p.weight).take(p.len) {
-            (sum, n) = (sum + w * g, n + w);
-        }
-        *l = sum / n;
-    }
-    if band.flat[1].len == 0 || band.flat[0].len == 0 {
+    let mean = |p: &Flat| p.grey.get(..p.len).map(|g| g.iter().sum::<f32>() / g.len() as f32);
+    let [outside, inside] = &band.flat;
+    let mut level = [mean(outside)?, mean(inside)?];
+    if outside.len == 0 || inside.len == 0 {
         let deep = |sign: f32| {
-            let mut best = (0.0_f32, 0.0_f32);
+            let (mut sum, mut n) = (0.0, 0.0);
             for (d, g) in band.depth.iter().zip(&band.rim.grey).take(band.rim.len) {
                 if sign * d > 0.6 {
-                    best = (best.0 + g, best.1 + 1.0);
+                    (sum, n) = (sum + g, n + 1.0);
                 }
             }
-            best.0 / best.1
+            sum / n
         };
         level = [deep(-1.0), deep(1.0)];
     }
-    level.iter().all(|l| l.is_finite()).then_some(Model {
-        shift: [0.0; 2],
-        level,
-        slope: [0.0; 2],
-        smear,
-        stretch: [0.0; 3],
-    })
+    level.iter().all(|l| l.is_finite()).then_some(Model { level, ..Model::new(smear) })
+}
+
+/// The same with the middle levels of the sectors, and the sectors that are far from them: something hides those.
+///
+/// Only flat pixels are asked, which a shift does not change.
+fn begin_carefully(band: &mut Band, smear: Smear) -> Option<(Model, Hidden)> {
+    let mut m = begin(band, smear)?;
+    let mut means = [[None; SECTORS]; 2];
+    for ((means, level), p) in means.iter_mut().zip(&mut m.level).zip(&band.flat) {
+        let mut all: heapless::Vec<f64, SECTORS> = heapless::Vec::new();
+        for (k, mean) in means.iter_mut().enumerate() {
+            let g = p.grey.get(p.sector[k]..p.sector[k + 1])?;
+            if g.len() >= 2 {
+                let v = g.iter().sum::<f32>() / g.len() as f32;
+                *mean = Some(v);
+                let _ = all.push(f64::from(v));
+            }
+        }
+        if !all.is_empty() {
+            *level = super::edge_fit::middle(&mut all) as f32;
+        }
+    }
+    let far = FAR_SHARE * m.step().abs();
+    let mut hidden = Hidden::default();
+    for k in 0..SECTORS {
+        if (0..2).any(|side| means[side][k].is_some_and(|v| (v - m.level[side]).abs() > far)) {
+            hidden.0 |= 1 << k;
+        }
+    }
+    hidden.apply(band);
+    Some((m, hidden))
 }
 
 /// Solves with a factor at hand; `None` where the pixels fix nothing.
@@ -123,14 +151,13 @@ fn solve<const N: usize>(
 ) -> Option<(SVector<f64, N>, Matrix2<f64>)> {
     let factor = matrix.cholesky()?;
     let p = factor.solve(right);
-    let mut unit = SMatrix::<f64, N, 2>::zeros();
-    (unit[(0, 0)], unit[(1, 1)]) = (1.0, 1.0);
+    let mut unit = SMatrix::<f64, N, 2>::identity();
     factor.solve_mut(&mut unit);
     let c = Matrix2::new(unit[(0, 0)], unit[(0, 1)], unit[(1, 0)], unit[(1, 1)]);
     p.iter().chain(c.iter()).all(|v| v.is_finite()).then_some((p, c))
 }
 
-/// The shift of a mark whose shape and blur are as predicted, about `start`.
+/// The shift of a mark whose shape and blur are as predicted and that nothing hides, about `start`.
 ///
 /// `None` when the shift is out of range or the pixels fix nothing. `sign` is +1 for a dark mark, -1 for a light one.
 pub(crate) fn track(
@@ -146,39 +173,74 @@ pub(crate) fn track(
     if f64::from(m.step()) * sign >= 0.0 {
         return None;
     }
-    let mut hidden = Hidden::default();
-    loop {
-        let mut e: Equations<PLAIN> = equations(band, &m);
-        let factor = e.matrix.cholesky()?;
-        let mut last = factor.solve(&e.right);
-        m.add(last.as_slice());
-        for _ in 0..3 {
-            if !(shift_length(&m) <= TRACK_RANGE) {
-                return None;
-            }
-            residuals(band, &m, &mut e);
-            let step = factor.solve(&e.right);
-            m.add(step.as_slice());
-            let before = math::sqrt(last[0] * last[0] + last[1] * last[1]);
-            last = step;
-            if before < SETTLED || math::sqrt(step[0] * step[0] + step[1] * step[1]) < 0.02 * SETTLED {
-                break;
-            }
-        }
+    let (e, unit) = iterate(band, &mut m)?;
+    let (pixels, squares) = e.flat;
+    let noise = squares / (pixels - 3.0).max(1.0);
+    let mut estimate = judged(band, &m, &e, unit, start, noise, [0.0; 3]);
+    // Flat pixels that are noisier than the rim itself are not flat.
+    if noise > ROUGH_FACTOR * estimate.rim_noise + math::sq(ROUGH_FLOOR * estimate.step) {
+        estimate.misfit_px = f64::INFINITY;
+    }
+    Some(estimate)
+}
+
+/// The same where something may hide a part of the rim: sectors that do not fit are left out.
+pub(crate) fn track_carefully(
+    band: &mut Band,
+    image: &ImageView<'_>,
+    outline: &Outline,
+    start: Vector2<f64>,
+    smear: Smear,
+    sign: f64,
+) -> Option<Estimate> {
+    band.gather(image, outline, start, f64::from(smear.reach()) + ROOM);
+    let (mut m, mut hidden) = begin_carefully(band, smear)?;
+    if f64::from(m.step()) * sign >= 0.0 {
+        return None;
+    }
+    for round in 0..=ROUNDS {
+        let (e, unit) = iterate(band, &mut m)?;
         let noise = flat_noise(band);
-        match worst_sector(band, &m, noise) {
-            Some(k) if hidden.count() < SECTORS / 2 => hidden.add(k, band),
-            worst => {
-                let (_, c) = solve(e.matrix, &e.right)?;
-                let mut estimate = judged(band, &m, &e, c, start, noise, [0.0; 3]);
-                estimate.hidden = hidden;
-                if worst.is_some() {
-                    estimate.misfit_px = f64::INFINITY;
-                }
-                return Some(estimate);
+        let next = review(band, &m, noise, hidden, HIDDEN_PX);
+        if next == hidden || round == ROUNDS {
+            let mut estimate = judged(band, &m, &e, unit, start, noise, [0.0; 3]);
+            estimate.hidden = hidden;
+            if next != hidden {
+                estimate.misfit_px = f64::INFINITY;
             }
+            return Some(estimate);
+        }
+        hidden = next;
+        hidden.apply(band);
+    }
+    None
+}
+
+/// Gauss-Newton on the plain model: one normal matrix, and looks with that until the shift has settled.
+///
+/// Returns the last equations and the shift's covariance for noise of one grey value.
+fn iterate(band: &mut Band, m: &mut Model) -> Option<(Equations<PLAIN>, Matrix2<f64>)> {
+    let mut e: Equations<PLAIN> = equations(band, m);
+    let factor = e.matrix.cholesky()?;
+    let mut last = factor.solve(&e.right);
+    m.add(last.as_slice());
+    for _ in 0..3 {
+        if !(shift_length(m) <= TRACK_RANGE) {
+            return None;
+        }
+        residuals(band, m, &mut e);
+        let step = factor.solve(&e.right);
+        m.add(step.as_slice());
+        let before = math::sqrt(last[0] * last[0] + last[1] * last[1]);
+        last = step;
+        if before < SETTLED || math::sqrt(step[0] * step[0] + step[1] * step[1]) < 0.02 * SETTLED {
+            break;
         }
     }
+    let mut unit = SMatrix::<f64, PLAIN, 2>::identity();
+    factor.solve_mut(&mut unit);
+    let unit = Matrix2::new(unit[(0, 0)], unit[(0, 1)], unit[(1, 0)], unit[(1, 1)]);
+    unit.iter().all(|v| v.is_finite()).then_some((e, unit))
 }
 
 fn shift_length(m: &Model) -> f64 {
@@ -186,7 +248,7 @@ fn shift_length(m: &Model) -> f64 {
     math::sqrt(x * x + y * y)
 }
 
-/// The middle sector's mean square, grey values squared: the noise, whatever hides less than half of the sectors.
+/// The third of the sectors' mean squares, grey values squared: the noise, whatever hides less than two thirds of the rim.
 fn flat_noise(band: &Band) -> f64 {
     let mut all: heapless::Vec<f64, SECTORS> = heapless::Vec::new();
     for k in 0..SECTORS {
@@ -196,30 +258,45 @@ fn flat_noise(band: &Band) -> f64 {
             let _ = all.push(f64::from((a.1 + b.1) / n));
         }
     }
-    super::edge_fit::middle(&mut all)
+    low(&mut all)
 }
 
-/// A sector of the rim that does not fit: the worst, if any is beyond chance.
-fn worst_sector(band: &Band, m: &Model, noise: f64) -> Option<usize> {
-    let floor = math::sq(SECTOR_FLOOR_PX * f64::from(m.step()));
-    let mut all: heapless::Vec<f64, SECTORS> = heapless::Vec::new();
-    let mut worst: Option<(usize, f64)> = None;
-    for k in 0..SECTORS {
-        let (n, squares) = band.rim.squares(k);
-        let (a, b) = (band.flat[0].squares(k), band.flat[1].squares(k));
-        let pixels = n + a.0 + b.0;
-        if pixels < 1.0 {
-            continue;
+/// The value that a third of the list lies below; 0 of none.
+fn low(v: &mut [f64]) -> f64 {
+    if v.is_empty() {
+        return 0.0;
+    }
+    let at = v.len() / 3;
+    *v.select_nth_unstable_by(at, f64::total_cmp).1
+}
+
+/// Sectors that do not fit, `hidden` being those that were left out: all that fit are taken in again, and the worst of those
+/// that do not is left out. `floor_px` is what the rim may be off by anyway.
+fn review(band: &Band, m: &Model, noise: f64, hidden: Hidden, floor_px: f64) -> Hidden {
+    let floor = math::sq(floor_px * f64::from(m.step()));
+    let mut seen: heapless::Vec<f64, SECTORS> = heapless::Vec::new();
+    let mean: [f64; SECTORS] = core::array::from_fn(|k| {
+        let all = [band.rim.squares(k), band.flat[0].squares(k), band.flat[1].squares(k)];
+        let (n, squares) = all.iter().fold((0.0, 0.0), |s, a| (s.0 + a.0, s.1 + a.1));
+        if n > 0.0 && !hidden.has(k) {
+            let _ = seen.push(f64::from(squares / n));
         }
-        let mean = f64::from((squares + a.1 + b.1) / pixels);
-        let _ = all.push(mean);
-        if worst.is_none_or(|w| mean > w.1) {
-            worst = Some((k, mean));
+        f64::from(squares / n.max(1.0))
+    });
+    let limit = SECTOR_FACTOR * low(&mut seen).max(noise) + floor;
+    let mut next = Hidden::default();
+    let mut worst: Option<usize> = None;
+    for (k, v) in mean.iter().enumerate().filter(|(_, v)| !(**v <= limit)) {
+        if hidden.has(k) {
+            next.0 |= 1 << k;
+        } else if worst.is_none_or(|w| *v > mean[w]) {
+            worst = Some(k);
         }
     }
-    let (k, mean) = worst?;
-    let middle = super::edge_fit::middle(&mut all).max(noise);
-    (mean > SECTOR_FACTOR * middle + floor).then_some(k)
+    if let Some(k) = worst {
+        next.0 |= 1 << k;
+    }
+    next
 }
 
 fn judged<const N: usize>(
@@ -247,6 +324,7 @@ fn judged<const N: usize>(
         stretch,
         step,
         misfit_px,
+        rim_noise: rim,
         hidden: Hidden::default(),
         share: f64::from(kept) / band.wanted.max(1) as f64,
         noise: math::sqrt(noise),
@@ -255,22 +333,21 @@ fn judged<const N: usize>(
 
 /// The shift with blur and shape fitted too, about an outline of roughly the right place, without sectors that do not fit.
 ///
-/// `hidden` are sectors known not to. Work is bounded: [`LOOKS`] looks, and two more for each of at most half of the sectors.
+/// Work is bounded: [`LOOKS`] looks, and two more for each of [`ROUNDS`] reviews.
 pub(crate) fn settle(
     band: &mut Band,
     image: &ImageView<'_>,
     outline: &Outline,
-    (start, hidden): (Vector2<f64>, Hidden),
+    start: Vector2<f64>,
     smear: Smear,
     sign: f64,
 ) -> Option<Estimate> {
-    let (mut outline, mut start, mut hidden) = (*outline, start, hidden);
+    let (mut outline, mut start) = (*outline, start);
     let mut total = [0.0_f64; 3];
     let expected = f64::from(smear.variance);
     band.gather(image, &outline, start, f64::from(smear.reach()) + 2.0 * ROOM);
-    hidden.apply(band);
-    let mut m = begin(band, smear)?;
-    let mut left = LOOKS;
+    let (mut m, mut hidden) = begin_carefully(band, smear)?;
+    let (mut left, mut rounds) = (LOOKS, ROUNDS);
     let mut noise = 4.0;
     loop {
         let mut e: Equations<WHOLE> = equations(band, &m);
@@ -298,12 +375,15 @@ pub(crate) fn settle(
         residuals(band, &m, &mut e);
         let flat = flat_noise(band);
         noise = flat.max(0.1);
-        match worst_sector(band, &m, flat) {
-            Some(k) if hidden.count() < SECTORS / 2 => {
-                hidden.add(k, band);
+        let next = review(band, &m, flat, hidden, SECTOR_FLOOR_PX);
+        match next == hidden || rounds == 0 {
+            false => {
+                hidden = next;
+                hidden.apply(band);
+                rounds -= 1;
                 left = 2;
             }
-            worst => {
+            true => {
                 if f64::from(m.step()) * sign >= 0.0 {
                     return None;
                 }
@@ -312,7 +392,7 @@ pub(crate) fn settle(
                 }
                 let mut estimate = judged(band, &m, &e, unit, start, flat, total);
                 estimate.hidden = hidden;
-                if worst.is_some() {
+                if next != hidden {
                     estimate.misfit_px = f64::INFINITY;
                 }
                 return Some(estimate);

@@ -30,6 +30,11 @@ pub(crate) struct Model {
 }
 
 impl Model {
+    /// Nothing known but the blur and the motion.
+    pub(crate) fn new(smear: Smear) -> Self {
+        Self { shift: [0.0; 2], level: [0.0; 2], slope: [0.0; 2], smear, stretch: [0.0; 3] }
+    }
+
     /// Grey difference inside minus outside.
     pub(crate) fn step(&self) -> f32 {
         self.level[1] - self.level[0]

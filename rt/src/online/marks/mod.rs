@@ -22,7 +22,7 @@ use crate::math;
 use crate::online::MarkObservation;
 use band::Band;
 use coverage::Smear;
-use estimate::{EXPLAINED_PX, Estimate, Hidden, settle, track};
+use estimate::{EXPLAINED_PX, Estimate, settle, track, track_carefully};
 use nalgebra::{Matrix2, Vector2};
 
 /// What a mark has to look like to be believed.
@@ -186,12 +186,18 @@ impl MarkMeter {
                 && e.share >= settings.min_share
                 && e.stretch.iter().all(|s| math::fabs(*s) <= settings.max_stretch)
         };
-        if let Some(tracked) = track(&mut self.band, image, outline, expected.start, smear, sign) {
+        let band = &mut self.band;
+        let start = expected.start;
+        if let Some(tracked) = track(band, image, outline, start, smear, sign)
+            && believed(&tracked, EXPLAINED_PX)
+        {
+            return Ok((tracked, false));
+        }
+        if let Some(tracked) = track_carefully(band, image, outline, start, smear, sign) {
             if believed(&tracked, EXPLAINED_PX) {
                 return Ok((tracked, false));
             }
-            let settled = settle(&mut self.band, image, outline, (tracked.shift, tracked.hidden), smear, sign);
-
+            let settled = settle(band, image, outline, tracked.shift, smear, sign);
             if let Some(settled) = settled.filter(|e| believed(e, CLOSE_PX)) {
                 return Ok((settled, true));
             }
@@ -199,8 +205,7 @@ impl MarkMeter {
         let found = search::search(image, outline, settings, expected.search_px, sign)?;
 
         let shape = outline.stretched(&found.stretch).ok_or(MarkMiss::Shape)?;
-        let settled = settle(&mut self.band, image, &shape, (found.shift, Hidden::default()), smear, sign)
-            .ok_or(MarkMiss::Shape)?;
+        let settled = settle(band, image, &shape, found.shift, smear, sign).ok_or(MarkMiss::Shape)?;
 
         let (base, slope) = FOUND_PX;
         let limit = base + slope * outline.minor;
