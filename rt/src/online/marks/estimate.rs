@@ -35,6 +35,8 @@ const HIDDEN_PX: f64 = 0.15;
 const ROUGH_FACTOR: f64 = 2.5;
 /// Roughness that does no harm, as a share of the step.
 const ROUGH_FLOOR: f64 = 0.01;
+/// Noise above which it is not taken for granted that nothing hides the mark, as a share of the step.
+const OPEN_NOISE: f64 = 0.05;
 /// A sector whose flat pixels are this share of the step off the others' level is hidden.
 const FAR_SHARE: f32 = 0.25;
 /// Changes of what is left out, at most: up to two thirds of the sectors.
@@ -177,8 +179,10 @@ pub(crate) fn track(
     let (pixels, squares) = e.flat;
     let noise = squares / (pixels - 3.0).max(1.0);
     let mut estimate = judged(band, &m, &e, unit, start, noise, [0.0; 3]);
-    // Flat pixels that are noisier than the rim itself are not flat.
-    if noise > ROUGH_FACTOR * estimate.rim_noise + math::sq(ROUGH_FLOOR * estimate.step) {
+    // Flat pixels that are noisier than the rim itself, or than a mark in the open has any reason to be, are not flat.
+    let step2 = math::sq(estimate.step);
+    let flat = noise <= ROUGH_FACTOR * estimate.rim_noise + math::sq(ROUGH_FLOOR) * step2;
+    if !(flat && noise <= math::sq(OPEN_NOISE) * step2) {
         estimate.misfit_px = f64::INFINITY;
     }
     Some(estimate)
