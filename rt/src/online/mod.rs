@@ -18,4 +18,4 @@ mod vision_cycle;
 
 pub use frame::{FrameFaults, FrameLimits, FrameReject, StereoFrame};
 pub use vision::{MarkObservation, Vision, VisionStatus};
-pub use vision_cycle::{VisionCycle, VisionHealth, VisionSettings};
+pub use vision_cycle::{StepStage, VisionCycle, VisionHealth, VisionSettings};

@@ -68,6 +68,19 @@ impl Default for VisionSettings {
     }
 }
 
+/// Parts of a step, in order; after the last comes the judgement.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StepStage {
+    /// Stamps, sizes, exposure.
+    Check,
+    /// Prediction and measurement of the marks.
+    Marks,
+    /// Pose, second look, and how well the rig explains the marks.
+    Pose,
+    /// Frozen images, and whether a camera was moved.
+    Watch,
+}
+
 /// What the last frame said about the cameras, beside the pose.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct VisionHealth {
@@ -213,19 +226,35 @@ impl VisionCycle {
     /// [`FrameReject`] when the pair, or the pose found in it, is not to be believed. The caller publishes nothing then, so that the
     /// last result ages; a *seen* loss of the marks is no error but a [`Vision`] with status [`VisionStatus::Lost`].
     pub fn step(&mut self, frame: &StereoFrame<'_>, base_from_gripper: Option<Pose>) -> Result<Vision, FrameReject> {
+        self.step_in_stages(frame, base_from_gripper, |_| {})
+    }
+
+    /// The same, telling when each stage has ended, for those who measure time.
+    ///
+    /// # Errors
+    /// See [`VisionCycle::step`].
+    pub fn step_in_stages(
+        &mut self,
+        frame: &StereoFrame<'_>,
+        base_from_gripper: Option<Pose>,
+        mut ended: impl FnMut(StepStage),
+    ) -> Result<Vision, FrameReject> {
         if let Err(reject) = frame::check(frame, &self.rig, &self.settings.frame, self.last_frame.as_ref()) {
             self.faults.count(&reject);
             return Err(reject);
         }
         self.accept(frame);
+        ended(StepStage::Check);
         let Some(track) = self.track else { return Ok(self.lost(frame)) };
         let (start, range) = self.predict(&track, frame, base_from_gripper);
         let motion = exp_twist(&(track.velocity * self.settings.exposure_s));
         let mut table: MarkTable = [[None; MAX_MARKS]; 2];
         self.measure(frame, &start, &motion, range, &mut table);
+        ended(StepStage::Marks);
         let Some(solved) = self.solve(frame, &start, &motion, &mut table) else {
             return Ok(self.miss(frame, track));
         };
+        ended(StepStage::Pose);
         // Before anything is refused: a moved camera is what would make the rest of this look wrong.
         let moves = self.watch.health().moves;
         let pose = &solved.estimate.left_from_gripper;
@@ -234,6 +263,7 @@ impl VisionCycle {
         if self.freeze.run() == 0 {
             self.watch.update(&self.rig, &self.gripper, &solved.seen, pose, base_from_gripper.as_ref());
         }
+        ended(StepStage::Watch);
         let moved = self.watch.health().moves != moves;
         if !solved.sound {
             return Ok(self.miss(frame, track));
