@@ -64,7 +64,7 @@ impl Sequence {
         let [left_from_rig, right_from_rig] = [pose(&cameras[0][7..]), pose(&cameras[1][7..])];
         let rig = Rig { left, right, right_from_left: right_from_rig * left_from_rig.inverse() };
         let file = root.join("marks.csv");
-        let mut marks = heapless::Vec::new();
+        let mut gripper = Gripper { marks: Default::default(), flange_from_gripper: Pose::identity() };
         for m in table(&file, 8, 3)? {
             let mark = Mark {
                 position: Vec3::new(m[1], m[2], m[3]),
@@ -72,9 +72,8 @@ impl Sequence {
                 radius: m[7],
                 dark: false,
             };
-            marks.push(mark).map_err(|_| unreadable(&file, "more than 32 marks"))?;
+            gripper.marks.push(mark).map_err(|_| unreadable(&file, "more than 32 marks"))?;
         }
-        let gripper = Gripper { marks, flange_from_gripper: Pose::identity() };
         let poses = table(&root.join("poses.csv"), 13, 1)?;
         let left_from_gripper: Vec<Pose> = poses.iter().map(|p| left_from_rig * pose(&p[1..])).collect();
         let goal = left_from_rig * pose(&table(&root.join("goal_pose.csv"), 13, 1)?[0][1..]);

@@ -8,7 +8,7 @@ use super::Outline;
 use crate::image::ImageView;
 use crate::math;
 use nalgebra::Vector2;
-use wide::f32x4;
+use wide::{f32x4, f32x8};
 
 /// Most pixels about the rim.
 pub(crate) const MAX_RIM: usize = 896;
@@ -25,6 +25,9 @@ const FLAT: f64 = 1.8;
 const MARGIN: f64 = 0.5;
 /// What is read outside the rim of the smallest marks, px.
 const LEAST_MARGIN: f64 = 1.2;
+
+/// Columns of eight pixels from the first.
+const EIGHT: f32x8 = f32x8::new([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
 
 /// Pixels of one kind, by columns; positions from the mark's predicted centre.
 #[derive(Clone, Debug)]
@@ -47,18 +50,33 @@ impl<const N: usize> Pixels<N> {
         Self { x: zero, y: zero, grey: zero, weight: zero, residual: zero, len: 0, sector: [0; SECTORS + 1] }
     }
 
-    /// Appends a piece of a row whose first pixel is at (`x`, `y`), as far as there is room.
+    /// Appends `count` pixels of a row from its column `from` on, the first at (`x`, `y`), as far as there is room.
+    ///
+    /// They are written by eights; what is written too much is written over by the next piece.
     #[inline(always)]
-    fn push(&mut self, row: &[u8], x: f32, y: f32) {
-        let mut x = x;
-        for v in row {
+    fn push(&mut self, row: &[u8], from: usize, count: usize, x: f32, y: f32) {
+        let (mut from, mut count, mut x) = (from, count, x);
+        while count > 0 {
             let k = self.len;
-            let (Some(px), Some(py), Some(g)) = (self.x.get_mut(k), self.y.get_mut(k), self.grey.get_mut(k)) else {
+            let (Some(px), Some(py), Some(g)) =
+                (self.x.get_mut(k..k + 8), self.y.get_mut(k..k + 8), self.grey.get_mut(k..k + 8))
+            else {
                 return;
             };
-            (*px, *py, *g) = (x, y, f32::from(*v));
-            self.len += 1;
-            x += 1.0;
+            px.copy_from_slice(&(EIGHT + f32x8::splat(x)).to_array());
+            py.fill(y);
+            if let Some(v) = row.get(from..from + 8) {
+                for (g, v) in g.iter_mut().zip(v) {
+                    *g = f32::from(*v);
+                }
+            } else {
+                for (g, v) in g.iter_mut().zip(row.get(from..).unwrap_or(&[])) {
+                    *g = f32::from(*v);
+                }
+            }
+            let n = count.min(8);
+            self.len += n;
+            (from, count, x) = (from + n, count - n, x + 8.0);
         }
     }
 
@@ -101,6 +119,8 @@ pub(crate) struct Band {
     pub(crate) curvature: [f32; MAX_RIM],
     /// Rim pixels that would be there if the image did not end.
     pub(crate) wanted: usize,
+    /// Sum of the pixels that were fetched ahead, which keeps the fetches.
+    touched: u8,
 }
 
 /// Boundaries in one row: first columns of outer flat, rim, inner flat and core; then the mirrored ends, core first.
@@ -115,6 +135,7 @@ impl Band {
             normal: [[0.0; MAX_RIM]; 2],
             curvature: [0.0; MAX_RIM],
             wanted: 0,
+            touched: 0,
         }
     }
 
@@ -132,7 +153,15 @@ impl Band {
         let count = rows.count;
         let mut bounds = [[0_i32; 9]; MAX_ROWS];
         for (i, b) in bounds.iter_mut().take(count).enumerate() {
-            *b = rows.bounds(rows.first + i as i32 * rows.step);
+            let row = rows.first + i as i32 * rows.step;
+            *b = rows.bounds(row);
+            // All rows are fetched at once: waiting for one after the other would be most of the time.
+            let y = base.y as i64 + i64::from(row);
+            let pixels = if y >= 0 { image.row(y as usize) } else { &[] };
+            for end in [b[0], b[8]] {
+                let v = pixels.get((base.x as i64 + i64::from(end)).max(0) as usize);
+                self.touched = self.touched.wrapping_add(v.copied().unwrap_or(0));
+            }
         }
         for block in 0..BLOCKS {
             let (from, to) = (block * count / BLOCKS, (block + 1) * count / BLOCKS);
@@ -178,15 +207,15 @@ impl Band {
                 continue;
             }
             let (lo, hi) = ((base + i64::from(from)).clamp(0, width), (base + i64::from(to)).clamp(0, width));
-            let piece = pixels.get(lo as usize..hi as usize).unwrap_or(&[]);
+            let (first, count) = (lo as usize, (hi - lo) as usize);
             let x = (lo - base) as f32 - at[0];
             match kind {
-                0 => self.flat[0].push(piece, x, at[1]),
+                0 => self.flat[0].push(pixels, first, count, x, at[1]),
                 1 => {
-                    self.rim.push(piece, x, at[1]);
+                    self.rim.push(pixels, first, count, x, at[1]);
                     self.wanted += (to - from) as usize;
                 }
-                _ => self.flat[1].push(piece, x, at[1]),
+                _ => self.flat[1].push(pixels, first, count, x, at[1]),
             }
         }
     }

@@ -11,6 +11,9 @@ use wide::f32x4;
 pub(crate) const PIXEL_VARIANCE: f32 = 1.0 / 12.0;
 /// Blur variance from which on the Gaussian alone is good to 0.3 % of the step, px².
 pub(crate) const KNOT: f32 = 0.09;
+/// Blur variance below which an image is taken for sharp, px²: it changes no pixel by more than 0.2 % of the step, and a single
+/// mark tells it from none only at noise below that.
+const LEAST_BLUR: f32 = 0.004;
 /// Largest blur variance that is modelled, px²: 2.5 px.
 pub(crate) const MAX_VARIANCE: f32 = 6.25;
 /// Smallest side of the trapezoid that is told from none: the edge it makes differs by less than 1e-4 of the step.
@@ -97,6 +100,8 @@ impl Profile {
         let [x, y] = smear.motion;
         if x * x + y * y > LEAST_BOX * LEAST_BOX {
             Profile::Moving { variance: v + PIXEL_VARIANCE, motion: smear.motion }
+        } else if v < LEAST_BLUR {
+            Profile::Sharp { blurred: 0.0, soft: Soft::new(KNOT) }
         } else if v < KNOT {
             Profile::Sharp { blurred: v / KNOT, soft: Soft::new(KNOT) }
         } else {

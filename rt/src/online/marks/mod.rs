@@ -73,7 +73,7 @@ pub enum MarkMiss {
 /// Largest predicted distance from centre to rim, pixels: 60 px marks with room to spare.
 const MAX_MAJOR: f64 = 48.0;
 /// Added to every covariance, px²: what rounding to whole grey values and the map's second order leave.
-const CENTRE_FLOOR: f64 = 0.0007 * 0.0007;
+const CENTRE_FLOOR: f64 = 0.0003 * 0.0003;
 /// Blur that is assumed until a mark has shown another, px² (0.6 px).
 pub const USUAL_BLUR: f64 = 0.36;
 /// Misfit of the rim, in pixels of its position, that is believed where blur and shape were fitted: a real mark is not quite
