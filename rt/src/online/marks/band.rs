@@ -8,7 +8,7 @@ use super::Outline;
 use crate::image::ImageView;
 use crate::math;
 use nalgebra::Vector2;
-use wide::{f32x4, f32x8};
+use wide::{f32x4, f32x8, i32x4};
 
 /// Most pixels about the rim.
 pub(crate) const MAX_RIM: usize = 896;
@@ -19,6 +19,8 @@ pub(crate) const SECTORS: usize = 12;
 const BLOCKS: usize = SECTORS / 2;
 /// Most rows that are read.
 const MAX_ROWS: usize = 112;
+/// Marks of at least this many rows have more flat pixels than their levels need: every second row of those is read.
+const DENSE_ROWS: usize = 18;
 /// Width of the flat bands, px.
 const FLAT: f64 = 1.8;
 /// Share of a mark's half width that is read outside its rim at most: a mark needs a margin of that much about it.
@@ -175,7 +177,7 @@ impl Band {
                         pixels,
                         base.x as i64,
                         b,
-                        side,
+                        (side, count < DENSE_ROWS || i % 2 == 0),
                         [offset.x as f32, f64::from(row) as f32 - offset.y as f32],
                     );
                 }
@@ -195,15 +197,15 @@ impl Band {
         }
     }
 
-    /// Takes one side of a row. `at` is (column of the centre from `base`, row from the centre).
+    /// Takes one side of a row, its flat pixels only where `flat`. `at` is (column of the centre from `base`, row from the centre).
     #[inline]
-    fn take(&mut self, pixels: &[u8], base: i64, b: &Row, side: usize, at: [f32; 2]) {
+    fn take(&mut self, pixels: &[u8], base: i64, b: &Row, (side, flat): (usize, bool), at: [f32; 2]) {
         let [a0, a1, a2, a3, middle, b3, b2, b1, b0] = *b;
         let pieces =
             if side == 0 { [(a0, a1), (a1, a2), (a2, a3.min(middle))] } else { [(b1, b0), (b2, b1), (b3, b2)] };
         let width = pixels.len() as i64;
         for (kind, (from, to)) in pieces.into_iter().enumerate() {
-            if to <= from {
+            if to <= from || !(flat || kind == 1) {
                 continue;
             }
             let (lo, hi) = ((base + i64::from(from)).clamp(0, width), (base + i64::from(to)).clamp(0, width));
@@ -336,10 +338,10 @@ impl Rows {
         let y = row as f32 - self.offset[1];
         let middle = self.offset[0] + self.lean * y;
         let half = (self.radii - self.squash * y * y).fast_max(f32x4::ZERO).sqrt();
-        let from = (f32x4::splat(middle + UP + 1.0) - half).to_array().map(|v| v as i32 - UP as i32);
-        let to = (f32x4::splat(middle + UP + 1.0) + half).to_array().map(|v| v as i32 - UP as i32);
         let m = (middle + UP + 1.0) as i32 - UP as i32;
-        let ([a0, a1, a2, a3], [b0, b1, b2, b3]) = (from.map(|v| v.min(m)), to.map(|v| v.max(m)));
+        let (middle, up, limit) = (f32x4::splat(middle + UP + 1.0), i32x4::splat(UP as i32), i32x4::splat(m));
+        let [a0, a1, a2, a3] = ((middle - half).fast_trunc_int() - up).min(limit).to_array();
+        let [b0, b1, b2, b3] = ((middle + half).fast_trunc_int() - up).max(limit).to_array();
         [a0, a1, a2, a3, m, b3, b2, b1, b0]
     }
 }

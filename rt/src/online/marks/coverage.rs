@@ -189,10 +189,10 @@ fn integral(z: f32x4, z2: f32x4) -> f32x4 {
 /// The normal density at z for |z| <= 3.2, from z², to 9e-5 (minimax).
 #[inline(always)]
 fn density(z2: f32x4) -> f32x4 {
-    let p = z2 * 8.668_881_7e-7 - 3.712_914e-5;
+    let p = z2 * 8.668_882e-7 - 3.712_914e-5;
     let p = p * z2 + 6.860_621e-4;
-    let p = p * z2 - 7.253_350_2e-3;
-    let p = p * z2 + 4.828_124_1e-2;
+    let p = p * z2 - 7.253_35e-3;
+    let p = p * z2 + 4.828_124e-2;
     let p = p * z2 - 1.985_578_1e-1;
     p * z2 + 0.398_855_83
 }

@@ -137,9 +137,11 @@ fn begin_carefully(band: &mut Band, smear: Smear) -> Option<(Model, Hidden)> {
     }
     let far = FAR_SHARE * m.step().abs();
     let mut hidden = Hidden::default();
-    for k in 0..SECTORS {
-        if (0..2).any(|side| means[side][k].is_some_and(|v| (v - m.level[side]).abs() > far)) {
-            hidden.0 |= 1 << k;
+    for (means, level) in means.iter().zip(&m.level) {
+        for (k, mean) in means.iter().enumerate() {
+            if mean.is_some_and(|v| (v - level).abs() > far) {
+                hidden.0 |= 1 << k;
+            }
         }
     }
     hidden.apply(band);

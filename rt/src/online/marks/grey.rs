@@ -109,12 +109,12 @@ pub(crate) fn equations<const N: usize>(band: &Band, m: &Model) -> Equations<N> 
     for k in (0..band.rim.len).step_by(4) {
         let l: Lane<N> = lane(band, k, m, &profile, bare);
         let w = four(&band.rim.weight, k);
-        for i in 0..N {
+        for (i, (sums, right)) in sum.iter_mut().zip(&mut right).enumerate() {
             let c = l.columns[i] * w;
-            for j in 0..=i {
-                sum[i][j] += c * l.columns[j];
+            for (s, other) in sums.iter_mut().zip(l.columns).take(i + 1) {
+                *s += c * other;
             }
-            right[i] += c * l.residual;
+            *right += c * l.residual;
         }
         let g = l.gain2 * w;
         weights += g;
@@ -127,9 +127,9 @@ pub(crate) fn equations<const N: usize>(band: &Band, m: &Model) -> Equations<N> 
         weights: f64::from(weights.reduce_add()),
         flat: (0.0, 0.0),
     };
-    for i in 0..N {
-        for j in 0..=i {
-            e.matrix[(i, j)] = f64::from(sum[i][j].reduce_add());
+    for (i, sums) in sum.iter().enumerate() {
+        for (j, s) in sums.iter().enumerate().take(i + 1) {
+            e.matrix[(i, j)] = f64::from(s.reduce_add());
         }
     }
     for side in 0..2 {
