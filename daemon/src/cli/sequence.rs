@@ -16,36 +16,36 @@ use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion};
 use std::path::{Path, PathBuf};
 
 /// One grey image.
-pub struct Image {
+pub(super) struct Image {
     /// Width in pixels.
-    pub width: usize,
+    pub(super) width: usize,
     /// Height in pixels.
-    pub height: usize,
+    pub(super) height: usize,
     /// Rows without gaps.
-    pub grey: Vec<u8>,
+    pub(super) grey: Vec<u8>,
 }
 
 /// One stereo pair.
-pub struct Frame {
+pub(super) struct Frame {
     /// Left and right.
-    pub images: [Image; 2],
+    pub(super) images: [Image; 2],
 }
 
 /// A sequence without its images.
-pub struct Sequence {
+pub(super) struct Sequence {
     root: PathBuf,
     /// Names of the conditions: folders with the same motion in other light.
-    pub conditions: Vec<String>,
+    pub(super) conditions: Vec<String>,
     /// The cameras, the left one's frame being the rig's.
-    pub rig: Rig,
+    pub(super) rig: Rig,
     /// The marks.
-    pub gripper: Gripper,
+    pub(super) gripper: Gripper,
     /// True poses, frame by frame.
-    pub left_from_gripper: Vec<Pose>,
+    pub(super) left_from_gripper: Vec<Pose>,
     /// The pose that the law is asked to reach.
-    pub goal: Pose,
+    pub(super) goal: Pose,
     /// True images of the discs' centres: frame, view, mark.
-    pub centres: Vec<[Vec<Pixel>; 2]>,
+    pub(super) centres: Vec<[Vec<Pixel>; 2]>,
 }
 
 impl Sequence {
@@ -53,7 +53,7 @@ impl Sequence {
     ///
     /// # Errors
     /// Names the file, the row and the column at fault.
-    pub fn read(root: &Path) -> Result<Self, Failure> {
+    pub(super) fn read(root: &Path) -> Result<Self, Failure> {
         let scene = root.join("scene.json");
         let text = std::fs::read_to_string(&scene).map_err(|e| unreadable(&scene, &e.to_string()))?;
         let scene_json: serde_json::Value =
@@ -86,7 +86,7 @@ impl Sequence {
     ///
     /// # Errors
     /// Names the image that cannot be read or has another size than its camera.
-    pub fn frames(&self, condition: &str) -> Result<Vec<Frame>, Failure> {
+    pub(super) fn frames(&self, condition: &str) -> Result<Vec<Frame>, Failure> {
         let one = |k: usize, eye: usize, camera: &Camera| -> Result<Image, Failure> {
             let file = self.root.join(condition).join(format!("cam{eye}")).join(format!("{k:06}.pgm"));
             let image = image::open(&file).map_err(|e| unreadable(&file, &e.to_string()))?.into_luma8();

@@ -18,13 +18,19 @@ const ROOM: f64 = 0.3;
 const TRACK_RANGE: f64 = 0.6;
 /// A step shorter than this leaves less than 1 % of itself, px (docs/TRACKER.md: one of 0.3 px leaves 0.016 px).
 const SETTLED: f64 = 0.05;
-/// Misfit of the rim, in pixels of its position, below which a model explains a mark: an eighth of the noise of one rim pixel
-/// at a contrast of a hundred grey values and four of noise.
-pub(crate) const EXPLAINED_PX: f64 = 0.03;
+/// Misfit of the rim, in pixels of its position, below which a model explains a mark: about what rounding to whole grey values
+/// leaves at a contrast of a hundred.
+pub(crate) const EXPLAINED_PX: f64 = 0.008;
+/// Deviations by which the rim's noise may exceed that of the flat pixels by chance: one mark in eighty is fitted anew in vain.
+const CHANCE: f64 = 2.5;
 /// How far the shape may be from the prediction before the data tell (one sigma of a relative stretch).
 const SHAPE_SIGMA: f64 = 0.05;
 /// How far the blur's variance may be from what is expected before the data tell, px² (one sigma).
-const BLUR_SIGMA: f64 = 1.0;
+const BLUR_SIGMA: f64 = 4.0;
+/// How steep the light is before the data tell, relative to itself, 1/px (one sigma): 5 % over a disc of 10 px.
+const SLOPE_SIGMA: f64 = 0.005;
+/// Noise that the slope's prior is weighed against, grey values squared.
+const USUAL_NOISE: f64 = 4.0;
 /// A sector whose mean square is this many times the middle one's is hidden by something: by chance, ten pixels are once in 10^6.
 const SECTOR_FACTOR: f64 = 5.0;
 /// Misfit that no sector is dropped for, pixels of the rim's position.
@@ -42,7 +48,7 @@ const FAR_SHARE: f32 = 0.25;
 /// Changes of what is left out, at most: up to two thirds of the sectors.
 const ROUNDS: usize = 2 * SECTORS / 3;
 /// Looks at the pixels in [`settle`] before sectors are judged.
-const LOOKS: usize = 5;
+const LOOKS: usize = 8;
 
 /// Sectors of a rim that something hides.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -227,26 +233,43 @@ pub(crate) fn track_carefully(
 /// Returns the last equations and the shift's covariance for noise of one grey value.
 fn iterate(band: &mut Band, m: &mut Model) -> Option<(Equations<PLAIN>, Matrix2<f64>)> {
     let mut e: Equations<PLAIN> = equations(band, m);
+    let slope = USUAL_NOISE / math::sq(SLOPE_SIGMA);
+    for k in [4, 5] {
+        e.matrix[(k, k)] += slope;
+    }
     let factor = e.matrix.cholesky()?;
-    let mut last = factor.solve(&e.right);
-    m.add(last.as_slice());
-    for _ in 0..3 {
+    let mut step = factor.solve(&e.right);
+    m.add(step.as_slice());
+    let mut settled = false;
+    for _ in 0..5 {
         if !(shift_length(m) <= TRACK_RANGE) {
             return None;
         }
         residuals(band, m, &mut e);
-        let step = factor.solve(&e.right);
+        for (k, g) in m.slope.iter().enumerate() {
+            e.right[4 + k] -= slope * f64::from(*g);
+        }
+        let before = length(&step, m);
+        step = factor.solve(&e.right);
         m.add(step.as_slice());
-        let before = math::sqrt(last[0] * last[0] + last[1] * last[1]);
-        last = step;
-        if before < SETTLED || math::sqrt(step[0] * step[0] + step[1] * step[1]) < 0.02 * SETTLED {
+        settled = before < SETTLED || length(&step, m) < 0.02 * SETTLED;
+        if settled {
             break;
         }
+    }
+    if !settled {
+        return None;
     }
     let mut unit = SMatrix::<f64, PLAIN, 2>::identity();
     factor.solve_mut(&mut unit);
     let unit = Matrix2::new(unit[(0, 0)], unit[(0, 1)], unit[(1, 0)], unit[(1, 1)]);
     unit.iter().all(|v| v.is_finite()).then_some((e, unit))
+}
+
+/// Size of a step as pixels of the rim: its shift, and what its change of levels is worth.
+fn length(step: &SVector<f64, PLAIN>, m: &Model) -> f64 {
+    let levels = math::fabs(step[2]) + math::fabs(step[3]);
+    math::sqrt(step[0] * step[0] + step[1] * step[1]) + levels / f64::from(m.step().abs()).max(1.0)
 }
 
 fn shift_length(m: &Model) -> f64 {
@@ -315,12 +338,12 @@ fn judged<const N: usize>(
     stretch: [f64; 3],
 ) -> Estimate {
     let step = f64::from(m.step());
-    // The noise as the shift sees it: each pixel's residual by its squared derivative. The rim's length in pixels is about the
-    // number of independent ones; two more are taken off because it is the inverse that has to be unbiased.
-    let pixels = e.weights / math::sq(step).max(1e-9);
+    // The noise as the shift sees it: each pixel's residual by its squared derivative, over as many pixels as weigh that much;
+    // two more are taken off because it is the inverse that has to be unbiased.
+    let pixels = math::sq(e.weights) / e.weights2.max(1e-12);
     let freedom = (pixels - (PLAIN - 2) as f64).max(2.0);
     let rim = e.weighted_squares / e.weights.max(1e-12) * (pixels / freedom);
-    let allowance = noise * (1.0 + 5.0 * math::sqrt(2.0 / freedom));
+    let allowance = noise * (1.0 + CHANCE * math::sqrt(2.0 / freedom));
     let misfit_px = math::sqrt((rim - allowance).max(0.0)) / math::fabs(step).max(1e-9);
     let kept: f32 = band.rim.weight[..band.rim.len].iter().sum();
     Estimate {
@@ -354,7 +377,7 @@ pub(crate) fn settle(
     band.gather(image, &outline, start, f64::from(smear.reach()) + 2.0 * ROOM);
     let (mut m, mut hidden) = begin_carefully(band, smear)?;
     let (mut left, mut rounds) = (LOOKS, ROUNDS);
-    let mut noise = 4.0;
+    let mut noise = USUAL_NOISE;
     loop {
         let mut e: Equations<WHOLE> = equations(band, &m);
         let matrix = with_priors(&mut e, &m, expected, &total, noise);
@@ -419,6 +442,11 @@ fn with_priors(
     let blur = noise / math::sq(BLUR_SIGMA);
     matrix[(6, 6)] += blur;
     e.right[6] += blur * (expected - f64::from(m.smear.variance));
+    let slope = noise / math::sq(SLOPE_SIGMA);
+    for (k, g) in m.slope.iter().enumerate() {
+        matrix[(4 + k, 4 + k)] += slope;
+        e.right[4 + k] -= slope * f64::from(*g);
+    }
     let shape = noise / math::sq(SHAPE_SIGMA);
     for (k, t) in total.iter().enumerate() {
         matrix[(7 + k, 7 + k)] += shape;

@@ -56,8 +56,9 @@ pub(crate) struct Equations<const N: usize> {
     pub(crate) right: SVector<f64, N>,
     /// Sum of squared residuals at the rim, weighted by the squared derivative of each.
     pub(crate) weighted_squares: f64,
-    /// Sum of those weights.
+    /// Sum of those weights, and of their squares.
     pub(crate) weights: f64,
+    pub(crate) weights2: f64,
     /// Flat pixels that count, and their squared residuals.
     pub(crate) flat: (f64, f64),
 }
@@ -105,7 +106,7 @@ pub(crate) fn equations<const N: usize>(band: &Band, m: &Model) -> Equations<N> 
     let bare = N == PLAIN && profile.is_bare();
     let mut sum = [[f32x4::ZERO; N]; N];
     let mut right = [f32x4::ZERO; N];
-    let (mut squares, mut weights) = (f32x4::ZERO, f32x4::ZERO);
+    let (mut squares, mut weights, mut weights2) = (f32x4::ZERO, f32x4::ZERO, f32x4::ZERO);
     for k in (0..band.rim.len).step_by(4) {
         let l: Lane<N> = lane(band, k, m, &profile, bare);
         let w = four(&band.rim.weight, k);
@@ -118,6 +119,7 @@ pub(crate) fn equations<const N: usize>(band: &Band, m: &Model) -> Equations<N> 
         }
         let g = l.gain2 * w;
         weights += g;
+        weights2 += g * g;
         squares += g * l.residual * l.residual;
     }
     let mut e = Equations {
@@ -125,6 +127,7 @@ pub(crate) fn equations<const N: usize>(band: &Band, m: &Model) -> Equations<N> 
         right: SVector::from_fn(|i, _| f64::from(right[i].reduce_add())),
         weighted_squares: f64::from(squares.reduce_add()),
         weights: f64::from(weights.reduce_add()),
+        weights2: f64::from(weights2.reduce_add()),
         flat: (0.0, 0.0),
     };
     for (i, sums) in sum.iter().enumerate() {
@@ -180,7 +183,7 @@ pub(crate) fn residuals<const N: usize>(band: &mut Band, m: &Model, e: &mut Equa
     let profile = Profile::new(&m.smear);
     let bare = N == PLAIN && profile.is_bare();
     let mut right = [f32x4::ZERO; N];
-    let (mut squares, mut weights) = (f32x4::ZERO, f32x4::ZERO);
+    let (mut squares, mut weights, mut weights2) = (f32x4::ZERO, f32x4::ZERO, f32x4::ZERO);
     for k in (0..band.rim.len).step_by(4) {
         let l: Lane<N> = lane(band, k, m, &profile, bare);
         let w = four(&band.rim.weight, k);
@@ -190,12 +193,14 @@ pub(crate) fn residuals<const N: usize>(band: &mut Band, m: &Model, e: &mut Equa
         }
         let g = l.gain2 * w;
         weights += g;
+        weights2 += g * g;
         squares += g * l.residual * l.residual;
         put(&mut band.rim.residual, k, l.residual);
     }
     e.right = SVector::from_fn(|i, _| f64::from(right[i].reduce_add()));
     e.weighted_squares = f64::from(squares.reduce_add());
     e.weights = f64::from(weights.reduce_add());
+    e.weights2 = f64::from(weights2.reduce_add());
     e.flat = (0.0, 0.0);
     for side in 0..2 {
         let level = m.level[side];
