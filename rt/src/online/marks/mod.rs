@@ -13,6 +13,8 @@ mod estimate;
 mod grey;
 mod outline;
 mod search;
+mod sectors;
+mod settle;
 
 pub use outline::{Footprint, MAX_OUTLINE, Outline, OutlinePoint, Quadratic, footprint, predict};
 
@@ -22,8 +24,9 @@ use crate::math;
 use crate::online::MarkObservation;
 use band::Band;
 use coverage::Smear;
-use estimate::{EXPLAINED_PX, Estimate, settle, track, track_carefully};
+use estimate::{EXPLAINED_PX, Estimate, track, track_carefully};
 use nalgebra::{Matrix2, Vector2};
+use settle::settle;
 
 /// What a mark has to look like to be believed.
 #[derive(Clone, Copy, Debug, PartialEq)]
