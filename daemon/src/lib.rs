@@ -18,6 +18,7 @@ pub mod arm;
 pub mod cli;
 pub mod config;
 pub mod exit;
+pub mod heap;
 pub mod links;
 pub mod log;
 pub mod realtime;

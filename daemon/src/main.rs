@@ -11,6 +11,10 @@ use std::time::Duration;
 /// Maximum time that the exit waits for a blocked log.
 const LOG_FLUSH_TIMEOUT: Duration = Duration::from_millis(300);
 
+/// So that `graspd bench` can say how often a stage asked for memory.
+#[global_allocator]
+static HEAP: graspd::heap::Counting = graspd::heap::Counting;
+
 fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
@@ -55,6 +59,9 @@ fn run(command: Command) -> Result<Exit, Failure> {
         Command::Setpoint(args) => cli::setpoint(&args),
         Command::Reconstruct(args) => cli::reconstruct(&args),
         Command::Study(args) => cli::study(&args),
+        Command::Bench(args) => match args.stage {
+            cli::BenchCommand::Track(args) => cli::bench_track(&args),
+        },
         #[cfg(feature = "demo")]
         Command::MockUr(p) => Ok(cli::simulator(graspd_hil::controller::main_with_args, "graspd-mock-ur", &p.args)),
         #[cfg(feature = "demo")]

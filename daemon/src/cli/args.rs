@@ -45,6 +45,8 @@ pub enum Command {
     Reconstruct(ReconstructArgs),
     /// Monte Carlo study of the off-line stage: errors against the Cramer-Rao bound
     Study(StudyArgs),
+    /// Time and accuracy of a stage on recorded data
+    Bench(BenchArgs),
     /// Check a configuration and every file it names; changes nothing
     Check(RunArgs),
     /// The mock UR controller (also a separate program: graspd-mock-ur)
@@ -138,6 +140,41 @@ pub struct StudyArgs {
     /// Only the cells whose name contains this text
     #[arg(long, value_name = "TEXT")]
     pub cell: Option<String>,
+}
+
+/// `graspd bench`.
+#[derive(Debug, Args)]
+pub struct BenchArgs {
+    /// Which stage.
+    #[command(subcommand)]
+    pub stage: BenchCommand,
+}
+
+/// The stages that can be measured.
+#[derive(Debug, Subcommand)]
+pub enum BenchCommand {
+    /// The tracker on a recorded stereo sequence with known truth
+    Track(BenchTrackArgs),
+}
+
+/// `graspd bench track`.
+#[derive(Debug, Args)]
+pub struct BenchTrackArgs {
+    /// Folder of the sequence: scene.json, cameras.csv, marks.csv, poses.csv, goal_pose.csv, truth.csv and the images
+    #[arg(value_name = "SEQ")]
+    pub sequence: PathBuf,
+    /// Only this condition
+    #[arg(long, value_name = "NAME")]
+    pub condition: Option<String>,
+    /// How often the sequence is played, forward and backward in turn
+    #[arg(long, default_value_t = 4)]
+    pub passes: usize,
+    /// Predict each frame by the true motion, as a robot's encoders would; without, by the motion of the frames before
+    #[arg(long)]
+    pub encoders: bool,
+    /// One JSON object for each condition
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// `graspd plan`.

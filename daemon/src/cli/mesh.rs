@@ -1,8 +1,8 @@
 //! `graspd plan --mesh`: a part with a CAD model (section 3.1 of the paper).
 
 use super::args::PlanArgs;
-use graspd_calib::commands::mesh::{MeshRequest, run};
 use graspd_calib::commands::Outcome;
+use graspd_calib::commands::mesh::{MeshRequest, run};
 
 /// Plans on a mesh.
 pub(super) fn plan(args: &PlanArgs) -> Outcome {

@@ -1,6 +1,7 @@
 //! The command line: one file a subcommand.
 
 mod args;
+mod bench_track;
 mod client;
 #[cfg(feature = "demo")]
 pub mod demo;
@@ -9,13 +10,15 @@ mod mesh_args;
 mod plan;
 mod reconstruct;
 mod run;
+mod sequence;
 mod simulator;
 mod study;
 
 pub use args::{
-    Cli, ClientArgs, Command, DemoArgs, GripperArgs, PassThrough, PlanArgs, ReconstructArgs, RunArgs, SetpointArgs,
-    StudyArgs,
+    BenchArgs, BenchCommand, BenchTrackArgs, Cli, ClientArgs, Command, DemoArgs, GripperArgs, PassThrough, PlanArgs,
+    ReconstructArgs, RunArgs, SetpointArgs, StudyArgs,
 };
+pub use bench_track::bench_track;
 pub use client::{recover, send, setpoint, stop};
 pub use mesh_args::MeshArgs;
 pub use plan::plan;

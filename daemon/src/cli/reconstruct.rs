@@ -13,7 +13,8 @@ pub fn reconstruct(args: &ReconstructArgs) -> Result<Exit, Failure> {
         .map_err(|message| Failure { exit: Exit::Usage, message })?;
     let text = std::fs::read_to_string(&args.cases)
         .map_err(|e| Failure::input(format!("{from}: cannot be read ({e}); give a file of cases (docs/FILES.md)")))?;
-    let results = graspd_calib::commands::reconstruct::reconstruct_file(&text).map_err(|e| Failure::input(format!("{from}: {e}")))?;
+    let results = graspd_calib::commands::reconstruct::reconstruct_file(&text)
+        .map_err(|e| Failure::input(format!("{from}: {e}")))?;
     std::fs::write(&args.out, results)
         .map_err(|e| Failure::input(format!("{to}: cannot be written ({e}); choose another file with --out")))?;
     Ok(Exit::Done)

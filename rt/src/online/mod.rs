@@ -39,4 +39,4 @@ pub use arm_motion::{ArmMotion, mid_exposure_ns};
 pub use frame::{FrameFaults, FrameLimits, FrameReject, StereoFrame};
 pub use observation::{MarkObservation, RigHealth};
 pub use vision::{Vision, VisionStatus};
-pub use vision_cycle::{VisionCycle, VisionHealth, VisionSettings};
+pub use vision_cycle::{StepStage, VisionCycle, VisionHealth, VisionSettings};

@@ -7,7 +7,7 @@ use super::MarkObservation;
 use crate::geom::{Pixel, Pose, Rig, Twist, Vec3, View, exp_twist};
 use crate::gripper::{Gripper, MAX_MARKS};
 use crate::math;
-use nalgebra::{Matrix2, Matrix2x6, Matrix3x6, Matrix6, Point3, Vector2, Vector6};
+use nalgebra::{Matrix2, Matrix2x6, Matrix3, Matrix3x6, Matrix6, Point3, Vector2, Vector6};
 
 /// Marks by view and mark index, as [`super::Vision`] carries them.
 pub type MarkTable = [[Option<MarkObservation>; MAX_MARKS]; 2];
@@ -113,6 +113,7 @@ fn linearize(rig: &Rig, pose: &Pose, o: &Observation) -> Option<(Vector2<f64>, M
 
 /// Estimates the pose from `marks`, starting at `start` (within some tens of pixels and degrees of the truth).
 ///
+/// From a good prediction, with marks that agree, three plain Gauss-Newton steps do ([`track`]); else the robust stage.
 /// Work is bounded: `settings.steps` robust steps, three plain ones, at most `2 * MAX_MARKS` observations each.
 ///
 /// # Errors
@@ -126,6 +127,9 @@ pub fn estimate(
 ) -> Result<PoseEstimate, PoseError> {
     let mut all = gather(gripper, marks);
     enough(&all)?;
+    if let Some(tracked) = track(rig, &all, start, settings) {
+        return Ok(tracked);
+    }
     let mut pose = *start;
     for step in 0..settings.steps.clamp(1, 30) {
         reweight(rig, &pose, &mut all, step >= 3, settings)?;
@@ -151,6 +155,116 @@ pub fn estimate(
         }
     }
     finish(rig, pose, &kept)
+}
+
+/// Plain steps that are tried before the robust stage.
+const PLAIN_STEPS: usize = 3;
+/// A plain step shorter than this is the last one, metres and radians: it changes no pixel by 1e-3.
+const LAST_STEP: (f64, f64) = (1e-6, 1e-6);
+
+/// One view as the plain steps need it.
+struct Placed {
+    /// Rotation of the view from the gripper, row by row.
+    r: Matrix3<f64>,
+    t: Vec3,
+}
+
+/// Sums over the observations at one pose.
+struct Sums {
+    h: Matrix6<f64>,
+    g: Vector6<f64>,
+    /// Weighted sum of squared errors.
+    chi2: f64,
+    /// The same with each observation's mean weight, and the sum of those.
+    squares: f64,
+    weights: f64,
+    /// Longest error, px².
+    longest2: f64,
+}
+
+/// Plain weighted Gauss-Newton from a prediction: the pose, if it converges at once and no mark is near the outlier gate.
+fn track(rig: &Rig, all: &Observations, start: &Pose, settings: &PoseSettings) -> Option<PoseEstimate> {
+    let mut pose = *start;
+    for _ in 0..PLAIN_STEPS {
+        let s = sums(rig, &pose, all)?;
+        let covariance = inverse(&s.h)?;
+        let xi: Twist = covariance * s.g;
+        let v2 = xi.fixed_rows::<3>(0).norm_squared();
+        let w2 = xi.fixed_rows::<3>(3).norm_squared();
+        if !(v2 < math::sq(0.05) && w2 < math::sq(0.1)) {
+            return None;
+        }
+        pose *= exp_twist(&xi);
+        if v2 > math::sq(LAST_STEP.0) || w2 > math::sq(LAST_STEP.1) {
+            continue;
+        }
+        if s.longest2 > math::sq(settings.gate_floor_px) {
+            return None;
+        }
+        pose.rotation.renormalize();
+        // The last step takes g.xi from the squares.
+        let chi2 = (s.chi2 - s.g.dot(&xi)).max(0.0);
+        let freedom = 2.0 * all.len() as f64 - 6.0;
+        let factor = if freedom > 0.5 { (chi2 / freedom).max(1.0) } else { 1.0 };
+        let mut used = [[false; MAX_MARKS]; 2];
+        for o in all {
+            if let Some(u) = used[o.view.index()].get_mut(o.mark) {
+                *u = true;
+            }
+        }
+        let residual_px = math::sqrt(s.squares / s.weights);
+        let t = &pose.translation.vector;
+        let finite = residual_px.is_finite() && t.iter().chain(pose.rotation.coords.iter()).all(|v| v.is_finite());
+        return finite.then_some(PoseEstimate {
+            left_from_gripper: pose,
+            covariance: covariance * factor,
+            residual_px,
+            used,
+        });
+    }
+    None
+}
+
+/// Normal equations and errors at a pose: [`linearize`] with everything that the observations of a view share worked out once.
+fn sums(rig: &Rig, pose: &Pose, all: &Observations) -> Option<Sums> {
+    let placed = View::BOTH.map(|view| {
+        let p = rig.view_from_left(view) * pose;
+        Placed { r: *p.rotation.to_rotation_matrix().matrix(), t: p.translation.vector }
+    });
+    let mut s = Sums { h: Matrix6::zeros(), g: Vector6::zeros(), chi2: 0.0, squares: 0.0, weights: 0.0, longest2: 0.0 };
+    for o in all {
+        let Placed { r, t } = &placed[o.view.index()];
+        let m = &o.point;
+        let (p, jx) = rig.camera(o.view).project_with_jacobian(&(r * m + t))?;
+        let e = o.pixel - p;
+        let j = jx * r;
+        // d(point)/d(xi) = [I, -[m]x]: a row a of the derivative by the point goes on with m x a.
+        let row = |k: usize| {
+            let a = [j[(k, 0)], j[(k, 1)], j[(k, 2)]];
+            [a[0], a[1], a[2], m.y * a[2] - m.z * a[1], m.z * a[0] - m.x * a[2], m.x * a[1] - m.y * a[0]]
+        };
+        let (u, v) = (row(0), row(1));
+        let (wxx, wxy, wyy) = (o.information[(0, 0)], o.information[(0, 1)], o.information[(1, 1)]);
+        let (ex, ey) = (wxx * e.x + wxy * e.y, wxy * e.x + wyy * e.y);
+        for i in 0..6 {
+            let (a, b) = (wxx * u[i] + wxy * v[i], wxy * u[i] + wyy * v[i]);
+            for k in 0..=i {
+                s.h[(i, k)] += a * u[k] + b * v[k];
+            }
+            s.g[i] += u[i] * ex + v[i] * ey;
+        }
+        let (e2, w) = (e.norm_squared(), 0.5 * (wxx + wyy));
+        s.chi2 += e.x * ex + e.y * ey;
+        s.squares += w * e2;
+        s.weights += w;
+        s.longest2 = s.longest2.max(e2);
+    }
+    for i in 0..6 {
+        for k in 0..i {
+            s.h[(k, i)] = s.h[(i, k)];
+        }
+    }
+    s.chi2.is_finite().then_some(s)
 }
 
 fn gather(gripper: &Gripper, marks: &MarkTable) -> Observations {

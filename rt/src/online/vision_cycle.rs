@@ -6,7 +6,7 @@
 
 use super::content::{FreezeWatch, badly_exposed};
 use super::frame::{self, FrameFaults, FrameLimits, FrameReject, LastFrame, StereoFrame};
-use super::marks::{self, MarkSettings, Outline};
+use super::marks::{self, Expected, MarkMeter, MarkSettings};
 use super::pose::{self, MarkTable, PoseEstimate, PoseSettings};
 use super::rig_fit::Evidence;
 use super::rig_watch::{RigWatch, RigWatchSettings};
@@ -14,7 +14,7 @@ use super::{Vision, VisionStatus};
 use crate::geom::{Pose, Rig, Twist, View, exp_twist, log_pose};
 use crate::gripper::{Gripper, MAX_MARKS};
 use crate::math;
-use nalgebra::Matrix6;
+use nalgebra::{Matrix6, Vector2};
 
 /// How frames are tracked and judged.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -39,6 +39,9 @@ pub struct VisionSettings {
     pub max_residual_px: f64,
     /// The rig's stated error, and when it counts as changed.
     pub rig: RigWatchSettings,
+    /// How long the cameras expose, seconds: marks are smeared along their predicted motion. Default 0, which takes images for
+    /// sharp; a smear of less than half a pixel makes no difference.
+    pub exposure_s: f64,
     /// Fewest different marks that make a pose worth having: three determine one, but then nothing says that one of
     /// them is wrong. Default 4.
     pub min_marks: usize,
@@ -58,10 +61,24 @@ impl Default for VisionSettings {
             max_sigma: 0.005,
             max_residual_px: 3.0,
             rig: RigWatchSettings::default(),
+            exposure_s: 0.0,
             min_marks: 4,
             coast_frames: 5,
         }
     }
+}
+
+/// Parts of a step, in order; after the last comes the judgement.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StepStage {
+    /// Stamps, sizes, exposure.
+    Check,
+    /// Prediction and measurement of the marks.
+    Marks,
+    /// Pose, second look, and how well the rig explains the marks.
+    Pose,
+    /// Frozen images, and whether a camera was moved.
+    Watch,
 }
 
 /// What the last frame said about the cameras, beside the pose.
@@ -94,6 +111,26 @@ struct Track {
     misses: u32,
 }
 
+/// Blur of one view's lens as its marks show it.
+#[derive(Clone, Copy, Debug)]
+struct LensBlur {
+    /// Mean of the last marks that were asked for it, px².
+    variance: f64,
+    marks: u32,
+}
+
+/// Marks over which the blur is averaged.
+const BLUR_MARKS: u32 = 16;
+
+impl LensBlur {
+    const UNKNOWN: Self = Self { variance: marks::USUAL_BLUR, marks: 0 };
+
+    fn learn(&mut self, variance: f64) {
+        self.marks = (self.marks + 1).min(BLUR_MARKS);
+        self.variance += (variance - self.variance) / f64::from(self.marks);
+    }
+}
+
 /// The tracker: rig, gripper, settings, and what it remembers.
 #[derive(Clone, Debug)]
 pub struct VisionCycle {
@@ -106,6 +143,8 @@ pub struct VisionCycle {
     faults: FrameFaults,
     health: VisionHealth,
     watch: RigWatch,
+    meter: MarkMeter,
+    blur: [LensBlur; 2],
 }
 
 /// A pose, whether it is sound, and what of its residual the rig's error does not explain.
@@ -130,6 +169,8 @@ impl VisionCycle {
             faults: FrameFaults::default(),
             health: VisionHealth::default(),
             watch: RigWatch::new(settings.rig),
+            meter: MarkMeter::new(),
+            blur: [LensBlur::UNKNOWN; 2],
         }
     }
 
@@ -185,18 +226,35 @@ impl VisionCycle {
     /// [`FrameReject`] when the pair, or the pose found in it, is not to be believed. The caller publishes nothing then, so that the
     /// last result ages; a *seen* loss of the marks is no error but a [`Vision`] with status [`VisionStatus::Lost`].
     pub fn step(&mut self, frame: &StereoFrame<'_>, base_from_gripper: Option<Pose>) -> Result<Vision, FrameReject> {
+        self.step_in_stages(frame, base_from_gripper, |_| {})
+    }
+
+    /// The same, telling when each stage has ended, for those who measure time.
+    ///
+    /// # Errors
+    /// See [`VisionCycle::step`].
+    pub fn step_in_stages(
+        &mut self,
+        frame: &StereoFrame<'_>,
+        base_from_gripper: Option<Pose>,
+        mut ended: impl FnMut(StepStage),
+    ) -> Result<Vision, FrameReject> {
         if let Err(reject) = frame::check(frame, &self.rig, &self.settings.frame, self.last_frame.as_ref()) {
             self.faults.count(&reject);
             return Err(reject);
         }
         self.accept(frame);
+        ended(StepStage::Check);
         let Some(track) = self.track else { return Ok(self.lost(frame)) };
         let (start, range) = self.predict(&track, frame, base_from_gripper);
+        let motion = exp_twist(&(track.velocity * self.settings.exposure_s));
         let mut table: MarkTable = [[None; MAX_MARKS]; 2];
-        self.measure(frame, &start, range, &mut table);
-        let Some(solved) = self.solve(frame, &start, &mut table) else {
+        self.measure(frame, &start, &motion, range, &mut table);
+        ended(StepStage::Marks);
+        let Some(solved) = self.solve(frame, &start, &motion, &mut table) else {
             return Ok(self.miss(frame, track));
         };
+        ended(StepStage::Pose);
         // Before anything is refused: a moved camera is what would make the rest of this look wrong.
         let moves = self.watch.health().moves;
         let pose = &solved.estimate.left_from_gripper;
@@ -205,6 +263,7 @@ impl VisionCycle {
         if self.freeze.run() == 0 {
             self.watch.update(&self.rig, &self.gripper, &solved.seen, pose, base_from_gripper.as_ref());
         }
+        ended(StepStage::Watch);
         let moved = self.watch.health().moves != moves;
         if !solved.sound {
             return Ok(self.miss(frame, track));
@@ -256,25 +315,42 @@ impl VisionCycle {
     }
 
     /// Measures every mark that `pose` puts before a camera and that `table` does not hold yet.
-    fn measure(&self, frame: &StereoFrame<'_>, pose: &Pose, range: f64, table: &mut MarkTable) {
+    ///
+    /// An error of the prediction moves the marks of a view nearly alike: each is looked for where those before it were.
+    fn measure(&mut self, frame: &StereoFrame<'_>, pose: &Pose, motion: &Pose, search_px: f64, table: &mut MarkTable) {
+        let Self { rig, gripper, settings, meter, blur, .. } = self;
         for view in View::BOTH {
-            for (mark, slot) in self.gripper.marks.iter().zip(table[view.index()].iter_mut()) {
-                if slot.is_none()
-                    && let Some(outline) = self.outline(view, pose, mark)
-                {
-                    *slot = marks::measure(frame.image(view), &outline, mark, &self.settings.marks, range).ok();
+            let camera_from_gripper = rig.view_from_left(view) * pose;
+            let moved = (settings.exposure_s > 0.0).then(|| camera_from_gripper * motion);
+            let (camera, blur) = (rig.camera(view), &mut blur[view.index()]);
+            let (mut start, mut found) = (Vector2::zeros(), 0.0);
+            for (mark, slot) in gripper.marks.iter().zip(table[view.index()].iter_mut()) {
+                if slot.is_some() {
+                    continue;
                 }
+                let Some(outline) = marks::predict(camera, &camera_from_gripper, mark, settings.marks.min_facing)
+                else {
+                    continue;
+                };
+                let motion = moved
+                    .and_then(|p| camera.project(&(p * nalgebra::Point3::from(mark.position)).coords))
+                    .map_or(Vector2::zeros(), |p| p - outline.centre);
+                let expected = Expected { search_px, start, blur: blur.variance, motion };
+                let Ok(m) = meter.measure(frame.image(view), &outline, mark, &settings.marks, &expected) else {
+                    continue;
+                };
+                if let Some(variance) = m.blur {
+                    blur.learn(variance);
+                }
+                found += 1.0;
+                start += (m.shift - start) / found;
+                *slot = Some(m.observation);
             }
         }
     }
 
-    fn outline(&self, view: View, pose: &Pose, mark: &crate::gripper::Mark) -> Option<Outline> {
-        let camera_from_gripper = self.rig.view_from_left(view) * pose;
-        marks::predict(self.rig.camera(view), &camera_from_gripper, mark, self.settings.marks.min_facing)
-    }
-
     /// Solves, looks once more about the solution for marks that were missing or thrown out, and solves again.
-    fn solve(&mut self, frame: &StereoFrame<'_>, start: &Pose, table: &mut MarkTable) -> Option<Solved> {
+    fn solve(&mut self, frame: &StereoFrame<'_>, start: &Pose, motion: &Pose, table: &mut MarkTable) -> Option<Solved> {
         let mut seen = *table;
         let mut best = pose::estimate(&self.rig, &self.gripper, table, start, &self.settings.pose).ok()?;
         let dropped = pose::keep_used(table, &best);
@@ -286,7 +362,7 @@ impl VisionCycle {
             *table = [[None; MAX_MARKS]; 2];
         }
         let had = count(table);
-        self.measure(frame, &best.left_from_gripper, narrow, table);
+        self.measure(frame, &best.left_from_gripper, motion, narrow, table);
         if count(table) == 0 {
             return None;
         }
@@ -382,15 +458,15 @@ impl VisionCycle {
         let mut full = true;
         for view in View::BOTH {
             let (mut expected, mut solid) = (0_u8, 0_u8);
+            let (camera, s) = (self.rig.camera(view), &self.settings.marks);
+            let [now, soon] = [e.left_from_gripper, soon].map(|p| self.rig.view_from_left(view) * p);
             for (i, mark) in self.gripper.marks.iter().enumerate() {
-                let camera = self.rig.camera(view);
                 let used = e.used[view.index()].get(i).copied().unwrap_or(false);
                 let inside = |pose: &Pose| {
-                    self.outline(view, pose, mark).is_some_and(|o| {
-                        camera.contains(o.centre, o.major + 2.0) && o.minor >= self.settings.marks.min_minor_px
-                    })
+                    marks::footprint(camera, pose, mark, s.min_facing)
+                        .is_some_and(|o| camera.contains(o.centre, o.major + 2.0) && o.minor >= s.min_minor_px)
                 };
-                let visible = inside(&e.left_from_gripper);
+                let visible = inside(&now);
                 expected += u8::from(visible || used);
                 solid += u8::from(used && visible && inside(&soon));
             }

@@ -5,6 +5,7 @@
 //! the work is a fixed number of samples whatever the image holds (fault M07).
 
 use super::Outline;
+use super::outline::OutlinePoint;
 use crate::image::ImageView;
 use crate::math;
 use nalgebra::Vector2;
@@ -59,14 +60,15 @@ impl Vote<'_, '_> {
 pub(crate) fn search(
     image: &ImageView<'_>,
     outline: &Outline,
+    points: &[OutlinePoint],
     sign: f64,
     range: f64,
     min_contrast: f64,
 ) -> Option<Coarse> {
-    let every = outline.points.len().div_ceil(MAX_DIRECTIONS).max(1);
+    let every = points.len().div_ceil(MAX_DIRECTIONS).max(1);
     let gap = (0.25 * outline.minor).clamp(1.5, 4.0);
     let mut rings = heapless::Vec::new();
-    for p in outline.points.iter().step_by(every) {
+    for p in points.iter().step_by(every) {
         let radial = p.pixel - outline.centre;
         let _ = rings.push(Ring { inner: outline.centre + radial * 0.65, outer: p.pixel + p.normal * gap });
     }

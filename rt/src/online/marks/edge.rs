@@ -1,6 +1,6 @@
 //! The edge of a disc along one normal of its outline, to a few hundredths of a pixel.
 
-use super::OutlinePoint;
+use super::outline::OutlinePoint;
 use crate::image::ImageView;
 use nalgebra::Vector2;
 

@@ -1,17 +1,22 @@
-//! The predicted image of one mark: where its outline runs, given the pose.
+//! The predicted image of one mark: the map between its disc and the pixels about it.
 //!
-//! The outline is the exact perspective image of the disc's rim through the lens model, not an ellipse: under distortion it
-//! is none, and the image of the disc's centre is neither its centroid nor its ellipse's centre (literature: discocal 2024).
-//! Measuring how this curve has to be *shifted* to fit the image therefore gives the centre's image without that bias.
+//! The image of a disc's rim is no ellipse under distortion, and the image of the disc's centre is neither its centroid nor its
+//! ellipse's centre (literature: discocal 2024). The map from disc to pixels is therefore kept to second order, fitted to eight
+//! exactly projected rim points: what it leaves out is of the order of the square of (radius / distance), 1e-5 of a radius at
+//! work distance. How the predicted rim has to be *shifted* to fit the image then gives the image of the centre without bias.
 
 use crate::geom::{Camera, Pixel, Pose, Vec3};
 use crate::gripper::Mark;
 use crate::math;
-use nalgebra::{Point3, Vector2};
+use nalgebra::{Matrix2, Matrix2x3, Point3, Vector2, Vector3};
 
 /// The largest number of points on a predicted outline.
 pub const MAX_OUTLINE: usize = 48;
 const MIN_OUTLINE: usize = 16;
+/// Cosine of 45 degrees.
+const HALF: f64 = core::f64::consts::FRAC_1_SQRT_2;
+/// The eight rim points at which the map is fitted, on the unit circle; the second four are opposite to the first.
+const NODES: [(f64, f64); 4] = [(1.0, 0.0), (HALF, HALF), (0.0, 1.0), (-HALF, HALF)];
 
 /// One point of a predicted outline.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -24,8 +29,61 @@ pub struct OutlinePoint {
     pub support: f64,
 }
 
+/// A map of the plane about a centre, to second order: `linear * u + square * (u.x², u.x u.y, u.y²)`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Quadratic {
+    /// First order.
+    pub linear: Matrix2<f64>,
+    /// Second order.
+    pub square: Matrix2x3<f64>,
+}
+
+impl Quadratic {
+    /// The image of `u`.
+    pub fn at(&self, u: Vector2<f64>) -> Vector2<f64> {
+        self.linear * u + self.square * monomials(u)
+    }
+
+    /// From the values at the eight nodes of the unit circle: `plus[k]` at node k, `minus[k]` opposite to it.
+    fn through(plus: &[Vector2<f64>; 4], minus: &[Vector2<f64>; 4]) -> Self {
+        let even: [Vector2<f64>; 4] = core::array::from_fn(|k| (plus[k] + minus[k]) * 0.5);
+        let mut linear = Matrix2::zeros();
+        for (k, (c, s)) in NODES.iter().enumerate() {
+            let odd = (plus[k] - minus[k]) * 0.25;
+            linear += Matrix2::from_columns(&[odd * *c, odd * *s]);
+        }
+        Self { linear, square: Matrix2x3::from_columns(&[even[0], even[1] - even[3], even[2]]) }
+    }
+
+    /// The same with its argument first mapped by `m`.
+    fn after(&self, m: &Matrix2<f64>) -> Self {
+        let (a, b) = (m.column(0).into_owned(), m.column(1).into_owned());
+        let (aa, bb) = (monomials(a), monomials(b));
+        let ab = Vector3::new(2.0 * a.x * b.x, a.x * b.y + a.y * b.x, 2.0 * a.y * b.y);
+        let s = &self.square;
+        Self { linear: self.linear * m, square: Matrix2x3::from_columns(&[s * aa, s * ab, s * bb]) }
+    }
+}
+
+fn monomials(u: Vector2<f64>) -> Vector3<f64> {
+    Vector3::new(u.x * u.x, u.x * u.y, u.y * u.y)
+}
+
+/// Where a mark's disc is in an image, and how large: from one projection.
+#[derive(Clone, Copy, Debug)]
+pub struct Footprint {
+    /// Image of the disc's centre.
+    pub centre: Pixel,
+    /// Largest distance of the outline from the centre, pixels, to first order.
+    pub major: f64,
+    /// Smallest distance of a tangent from the centre, pixels, to first order.
+    pub minor: f64,
+    /// Cosine of the angle between the disc's normal and the direction to the camera.
+    pub facing: f64,
+}
+
 /// Predicted image of a mark.
-#[derive(Clone, Debug)]
+#[derive(Clone, Copy, Debug)]
 pub struct Outline {
     /// Image of the disc's centre.
     pub centre: Pixel,
@@ -35,8 +93,42 @@ pub struct Outline {
     pub minor: f64,
     /// Cosine of the angle between the disc's normal and the direction to the camera.
     pub facing: f64,
-    /// The rim, in order, anticlockwise in the disc's own frame.
-    pub points: heapless::Vec<OutlinePoint, MAX_OUTLINE>,
+    /// Pixels from the centre, from disc coordinates (the rim is the unit circle).
+    pub pixel_from_disc: Quadratic,
+    /// Disc coordinates from pixels from the centre.
+    pub disc_from_pixel: Quadratic,
+}
+
+impl Outline {
+    /// About one point a pixel of rim, in order: closer ones would see the same pixels and add work, not information.
+    pub fn rim(&self) -> heapless::Vec<OutlinePoint, MAX_OUTLINE> {
+        let circumference = core::f64::consts::PI * (self.major + self.minor);
+        let count = (circumference as usize).clamp(MIN_OUTLINE, MAX_OUTLINE);
+        let (ds, dc) = math::sin_cos(core::f64::consts::TAU / count as f64);
+        let Quadratic { linear, square } = &self.pixel_from_disc;
+        let turn = if linear.determinant() < 0.0 { -1.0 } else { 1.0 };
+        let (mut s, mut c) = (0.0, 1.0);
+        let mut points = heapless::Vec::new();
+        for _ in 0..count {
+            let q = self.pixel_from_disc.at(Vector2::new(c, s));
+            let t = linear * Vector2::new(-s, c) + square * Vector3::new(-2.0 * c * s, c * c - s * s, 2.0 * c * s);
+            let normal = Vector2::new(t.y, -t.x) * (turn / math::sqrt(t.norm_squared()));
+            let _ = points.push(OutlinePoint { pixel: self.centre + q, normal, support: normal.dot(&q) });
+            (s, c) = (s * dc + c * ds, c * dc - s * ds);
+        }
+        points
+    }
+
+    /// The outline with its shape changed: a rim point at `q` from the centre moves to `q + stretch q`.
+    pub fn stretched(&self, stretch: &[f64; 3]) -> Option<Self> {
+        let [xx, xy, yy] = *stretch;
+        let m = Matrix2::new(1.0 + xx, xy, xy, 1.0 + yy);
+        let back = m.try_inverse()?;
+        let b = &self.pixel_from_disc;
+        let b = Quadratic { linear: m * b.linear, square: m * b.square };
+        let (major, minor) = extent(&b.linear)?;
+        Some(Self { major, minor, pixel_from_disc: b, disc_from_pixel: self.disc_from_pixel.after(&back), ..*self })
+    }
 }
 
 /// Two unit vectors that complete `n` to a right-handed frame.
@@ -50,57 +142,71 @@ fn tangents(n: &Vec3) -> (Vec3, Vec3) {
     (a, n.cross(&a))
 }
 
+/// Singular values of the disc's first order: the half axes of its image.
+fn extent(b: &Matrix2<f64>) -> Option<(f64, f64)> {
+    let (p, q) = (b[(0, 0)] + b[(1, 1)], b[(1, 0)] - b[(0, 1)]);
+    let (r, s) = (b[(0, 0)] - b[(1, 1)], b[(1, 0)] + b[(0, 1)]);
+    let (m, n) = (math::sqrt(p * p + q * q), math::sqrt(r * r + s * s));
+    let (major, minor) = (0.5 * (m + n), 0.5 * math::fabs(m - n));
+    (major.is_finite() && minor > 0.0).then_some((major, minor))
+}
+
+/// A disc in a camera's frame: its centre, normal, and the cosine at which it faces the camera.
+///
+/// `None` when it faces away (below `min_facing`), is behind the camera or too near to it, or when a figure is not finite.
+fn disc(camera_from_gripper: &Pose, mark: &Mark, min_facing: f64) -> Option<(Vec3, Vec3, f64)> {
+    let centre = (camera_from_gripper * Point3::from(mark.position)).coords;
+    let normal = camera_from_gripper.rotation * mark.normal;
+    let distance = math::sqrt(centre.norm_squared());
+    if !(centre.z > 3.0 * mark.radius && distance.is_finite()) {
+        return None;
+    }
+    let facing = -normal.dot(&centre) / distance;
+    (facing >= min_facing).then_some((centre, normal, facing))
+}
+
+/// Where a mark is in a camera's image and how large, to first order.
+///
+/// `None` for the same reasons as [`predict`].
+pub fn footprint(camera: &Camera, camera_from_gripper: &Pose, mark: &Mark, min_facing: f64) -> Option<Footprint> {
+    let (centre3, normal, facing) = disc(camera_from_gripper, mark, min_facing)?;
+    let (a, b) = tangents(&normal);
+    let (centre, j) = camera.project_with_jacobian(&centre3)?;
+    let (major, minor) = extent(&Matrix2::from_columns(&[j * a * mark.radius, j * b * mark.radius]))?;
+    Some(Footprint { centre, major, minor, facing })
+}
+
 /// Predicts a mark's outline in a camera.
 ///
 /// `None` when the disc faces away (`facing` below `min_facing`), is behind the camera or too near to it, or when a figure is
 /// not finite. The outline may lie outside the image: the caller decides.
 pub fn predict(camera: &Camera, camera_from_gripper: &Pose, mark: &Mark, min_facing: f64) -> Option<Outline> {
-    let centre3 = (camera_from_gripper * Point3::from(mark.position)).coords;
-    let normal = camera_from_gripper.rotation * mark.normal;
-    let distance = math::sqrt(centre3.norm_squared());
-    if !(centre3.z > 3.0 * mark.radius && distance.is_finite()) {
-        return None;
-    }
-    let facing = -normal.dot(&centre3) / distance;
-    if !(facing >= min_facing) {
-        return None;
-    }
+    let (centre3, normal, facing) = disc(camera_from_gripper, mark, min_facing)?;
     let centre = camera.project(&centre3)?;
-    let radius_px = 0.5 * (camera.fx + camera.fy) * mark.radius / centre3.z;
-    if !(radius_px > 0.0 && radius_px < 1e4) {
-        return None;
-    }
-    // About one point a pixel of rim: closer ones would see the same pixels and add work, not information.
-    let circumference = core::f64::consts::TAU * radius_px * (0.5 + 0.5 * facing);
-    let count = (circumference as usize).clamp(MIN_OUTLINE, MAX_OUTLINE);
     let (a, b) = tangents(&normal);
-    let (ds, dc) = math::sin_cos(core::f64::consts::TAU / count as f64);
-    let (mut s, mut c) = (0.0, 1.0);
-    let mut points: heapless::Vec<OutlinePoint, MAX_OUTLINE> = heapless::Vec::new();
-    for _ in 0..count {
-        let radial = a * c + b * s;
-        let along = b * c - a * s;
-        let (pixel, j) = camera.project_with_jacobian(&(centre3 + radial * mark.radius))?;
-        let t = j * along;
-        let l = math::sqrt(t.norm_squared());
-        if !(l > 1e-9) {
-            return None;
-        }
-        let mut normal = Vector2::new(t.y / l, -t.x / l);
-        let mut support = normal.dot(&(pixel - centre));
-        if support < 0.0 {
-            normal = -normal;
-            support = -support;
-        }
-        points.push(OutlinePoint { pixel, normal, support }).ok()?;
-        (s, c) = (s * dc + c * ds, c * dc - s * ds);
+    let (a, b) = (a * mark.radius, b * mark.radius);
+    let (mut plus, mut minus) = ([Vector2::zeros(); 4], [Vector2::zeros(); 4]);
+    for (k, (c, s)) in NODES.iter().enumerate() {
+        let radial = a * *c + b * *s;
+        plus[k] = camera.project(&(centre3 + radial))? - centre;
+        minus[k] = camera.project(&(centre3 - radial))? - centre;
     }
-    let mut major: f64 = 0.0;
-    let mut minor = f64::INFINITY;
-    for p in &points {
-        major = major.max((p.pixel - centre).norm_squared());
-        minor = minor.min(p.support);
-    }
-    let major = math::sqrt(major);
-    (major.is_finite() && minor > 0.0).then_some(Outline { centre, major, minor, facing, points })
+    let pixel_from_disc = Quadratic::through(&plus, &minus);
+    let (major, minor) = extent(&pixel_from_disc.linear)?;
+    let disc_from_pixel = inverse(&pixel_from_disc, &plus, &minus)?;
+    Some(Outline { centre, major, minor, facing, pixel_from_disc, disc_from_pixel })
+}
+
+/// The inverse to second order, then corrected by what it misses at the nodes.
+fn inverse(forward: &Quadratic, plus: &[Vector2<f64>; 4], minus: &[Vector2<f64>; 4]) -> Option<Quadratic> {
+    let a = forward.linear.try_inverse()?;
+    let back = Quadratic { linear: Matrix2::identity(), square: -(a * forward.square) }.after(&a);
+    let node = |k: usize, sign: f64| Vector2::new(NODES[k].0, NODES[k].1) * sign;
+    let missed = Quadratic::through(
+        &core::array::from_fn(|k| node(k, 1.0) - back.at(plus[k])),
+        &core::array::from_fn(|k| node(k, -1.0) - back.at(minus[k])),
+    )
+    .after(&a);
+    let inverse = Quadratic { linear: back.linear + missed.linear, square: back.square + missed.square };
+    inverse.linear.iter().chain(inverse.square.iter()).all(|v| v.is_finite()).then_some(inverse)
 }

@@ -2,9 +2,9 @@
 
 use super::Outline;
 use super::edge::Edge;
-use super::outline::MAX_OUTLINE;
+use super::outline::{MAX_OUTLINE, OutlinePoint};
 use crate::math;
-use nalgebra::{Matrix2, Matrix5, Vector2, Vector5};
+use nalgebra::{Matrix5, Vector2, Vector5};
 
 /// How far the shape may be from the prediction before edges tell (one sigma of a relative stretch): a small arc then still
 /// gives a centre, with the prediction's shape.
@@ -17,7 +17,6 @@ const EDGE_FLOOR: f64 = 0.015;
 pub(crate) struct Fit {
     pub(crate) shift: Vector2<f64>,
     pub(crate) stretch: [f64; 3],
-    pub(crate) covariance: Matrix2<f64>,
     /// Weighted root mean square distance of the used edges, pixels.
     pub(crate) rms: f64,
     /// Sum of the weights over the number of outline points: the share of the rim that agrees.
@@ -47,9 +46,14 @@ impl Line {
 }
 
 /// Refines `from` by edges measured relative to the outline as `from` moved it; robust (Tukey) least squares.
-pub(crate) fn refine(outline: &Outline, edges: &[Option<Edge>; MAX_OUTLINE], from: &Fit) -> Option<Fit> {
+pub(crate) fn refine(
+    outline: &Outline,
+    points: &[OutlinePoint],
+    edges: &[Option<Edge>; MAX_OUTLINE],
+    from: &Fit,
+) -> Option<Fit> {
     let mut lines = Lines::new();
-    for (p, e) in outline.points.iter().zip(edges) {
+    for (p, e) in points.iter().zip(edges) {
         let Some(e) = e else { continue };
         let _ = lines.push(Line { a: row(p.normal, p.pixel - outline.centre), offset: e.offset });
     }
@@ -59,7 +63,6 @@ pub(crate) fn refine(outline: &Outline, edges: &[Option<Edge>; MAX_OUTLINE], fro
     let mut spread = initial_spread(&lines);
     let mut x = Vector5::zeros();
     for round in 0..5 {
-        let inv_var = 1.0 / (spread * spread);
         let (n, g) = equations(&lines, &x, spread, round == 0, from);
         let factor = n.cholesky()?;
         let next = factor.solve(&g);
@@ -79,7 +82,7 @@ pub(crate) fn refine(outline: &Outline, edges: &[Option<Edge>; MAX_OUTLINE], fro
                 stretch: [from.stretch[0] + x[2], from.stretch[1] + x[3], from.stretch[2] + x[4]],
                 ..Fit::default()
             };
-            return judged(fit, outline, &lines, &x, found, factor.inverse().fixed_view::<2, 2>(0, 0) * inv_var);
+            return judged(fit, points.len(), &lines, &x, found);
         }
         spread = found;
     }
@@ -115,15 +118,8 @@ fn equations(lines: &Lines, x: &Vector5<f64>, spread: f64, early: bool, from: &F
     (n, g)
 }
 
-/// Share of the rim, spread and covariance of a solution; `shape` is the covariance's shape for edges of unit spread.
-fn judged(
-    fit: Fit,
-    outline: &Outline,
-    lines: &Lines,
-    x: &Vector5<f64>,
-    spread: f64,
-    shape: Matrix2<f64>,
-) -> Option<Fit> {
+/// Share of the rim and spread of a solution.
+fn judged(fit: Fit, points: usize, lines: &Lines, x: &Vector5<f64>, spread: f64) -> Option<Fit> {
     let (mut sw, mut swr2) = (0.0, 0.0);
     for l in lines {
         let r = l.residual(x);
@@ -134,13 +130,7 @@ fn judged(
     if sw < 5.0 {
         return None;
     }
-    let sigma = math::sqrt(swr2 / (sw - 4.0).max(1.0)).max(EDGE_FLOOR);
-    Some(Fit {
-        covariance: shape * (sigma * sigma),
-        rms: math::sqrt(swr2 / sw),
-        share: sw / outline.points.len() as f64,
-        ..fit
-    })
+    Some(Fit { rms: math::sqrt(swr2 / sw), share: sw / points as f64, ..fit })
 }
 
 fn row(n: Vector2<f64>, q: Vector2<f64>) -> [f64; 5] {
