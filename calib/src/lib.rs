@@ -1,6 +1,7 @@
 //! Everything graspd computes before the arm moves.
 #![forbid(unsafe_code)]
 
+pub mod calibrate;
 pub mod files;
 pub mod golden;
 pub mod mesh_cli;

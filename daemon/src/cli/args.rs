@@ -47,6 +47,12 @@ pub enum Command {
     Study(StudyArgs),
     /// Check a configuration and every file it names, and touch nothing
     Check(RunArgs),
+    /// Calibrate from images of a target, or ask whether a stored calibration is still right
+    #[command(subcommand)]
+    Calibrate(super::calibrate::CalibrateCommand),
+    /// Read, write and show rig calibrations in the formats of other tools
+    #[command(subcommand)]
+    Rig(super::rig::RigCommand),
     /// The mock UR controller (also a program of its own: graspd-mock-ur)
     #[cfg(feature = "demo")]
     #[command(hide = true, disable_help_flag = true)]
