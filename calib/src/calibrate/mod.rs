@@ -5,5 +5,6 @@
 //! 3. [`report`]: what people look at; [`command`]: options in, files and figures out.
 
 pub mod command;
+pub mod report;
 pub mod rig;
 pub mod target;

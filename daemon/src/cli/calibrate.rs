@@ -46,6 +46,9 @@ pub struct CalibrateRigArgs {
     /// Where to write a one-page report
     #[arg(long, value_name = "rig.html")]
     pub report: Option<PathBuf>,
+    /// Where to write the target's points as they were found (JSON), for other tools
+    #[arg(long, value_name = "FILE.json")]
+    pub corners: Option<PathBuf>,
     /// Lens model: brown (k1 k2 p1 p2 k3) or rational (k4 k5 k6 as well)
     #[arg(long, value_name = "MODEL", default_value = "brown", value_parser = ["brown", "rational"])]
     pub lens: String,
@@ -80,8 +83,9 @@ pub fn calibrate(command: &CalibrateCommand) -> Result<Exit, Failure> {
 }
 
 fn rig(args: &CalibrateRigArgs) -> Result<Exit, Failure> {
-    keep_apart(&[("--out", args.out.as_deref()), ("--report", args.report.as_deref())], &[])
-        .map_err(|message| Failure { exit: Exit::Usage, message })?;
+    let outputs =
+        [("--out", args.out.as_deref()), ("--report", args.report.as_deref()), ("--corners", args.corners.as_deref())];
+    keep_apart(&outputs, &[]).map_err(|message| Failure { exit: Exit::Usage, message })?;
     let outcome = command::calibrate_rig(&command::RigRequest {
         left: args.pairs.left.clone(),
         right: args.pairs.right.clone(),
@@ -91,6 +95,7 @@ fn rig(args: &CalibrateRigArgs) -> Result<Exit, Failure> {
         tolerance_mm: args.tolerance_mm,
         out: args.out.clone(),
         report: args.report.clone(),
+        corners: args.corners.clone(),
     });
     finish(args.pairs.json, outcome)
 }

@@ -6,6 +6,7 @@
 //! [`verdict`]: words. [`calibrate()`]: all of it.
 
 pub mod bundle;
+mod calibration;
 mod consensus;
 pub mod coverage;
 pub mod holdout;
@@ -15,6 +16,9 @@ pub mod parameters;
 pub mod predict;
 pub mod score;
 pub mod solve;
+pub mod verdict;
+
+pub use calibration::{Calibration, Options, calibrate};
 
 use crate::calibrate::target::Seen;
 
@@ -65,4 +69,18 @@ pub enum CalibrateError {
     /// The fit does not come to an end.
     #[error("the joint fit does not converge: take more pairs, with the target tilted in different directions")]
     NoFit,
+    /// The lens model folds.
+    #[error(
+        "the {side} lens model folds the image over itself: the target was not seen near the image's corners, where the coefficients run free; take images there"
+    )]
+    Folds {
+        /// Which camera.
+        side: &'static str,
+    },
+    /// Nothing is seen by both cameras there.
+    #[error("nothing between {:.2} and {:.2} m is seen by both cameras: give --volume as NEAR,FAR in metres", range_m[0], range_m[1])]
+    NoVolume {
+        /// Distances, metres.
+        range_m: [f64; 2],
+    },
 }

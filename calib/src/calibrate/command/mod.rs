@@ -1,5 +1,9 @@
 //! `graspd calibrate` and `graspd rig` without the command line: options in, files and figures out, every failure in words.
 
+mod rig;
+
+pub use rig::calibrate_rig;
+
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -46,6 +50,8 @@ pub struct RigRequest {
     pub out: Option<PathBuf>,
     /// Where to write the report.
     pub report: Option<PathBuf>,
+    /// Where to write the points found.
+    pub corners: Option<PathBuf>,
 }
 
 /// What `graspd calibrate check` is asked.
@@ -89,35 +95,40 @@ pub struct ExportRequest {
     pub accept_loss_px: f64,
 }
 
-fn usage(text: &str) -> Outcome {
-    Outcome {
-        answer: Answer::Usage,
-        text: text.to_owned(),
-        json: json!({ "status": "error", "kind": "usage", "reason": text }),
+/// A failure: how it ended, a word for machines, a sentence for people.
+struct Failure(Answer, &'static str, String);
+
+impl From<Failure> for Outcome {
+    fn from(Failure(answer, kind, text): Failure) -> Self {
+        let json = json!({ "status": "error", "kind": kind, "reason": text });
+        Self { answer, text, json }
     }
 }
 
-/// Runs `graspd calibrate rig`.
-pub fn calibrate_rig(_request: &RigRequest) -> Outcome {
-    usage("calibrate rig is not in this build")
+fn usage(text: impl Into<String>) -> Failure {
+    Failure(Answer::Usage, "usage", text.into())
+}
+
+fn input(text: impl std::fmt::Display) -> Failure {
+    Failure(Answer::Input, "input", text.to_string())
 }
 
 /// Runs `graspd calibrate check`.
 pub fn check_rig(_request: &CheckRequest) -> Outcome {
-    usage("calibrate check is not in this build")
+    usage("calibrate check is not in this build").into()
 }
 
 /// Runs `graspd rig import`.
 pub fn import_rig(_request: &ImportRequest) -> Outcome {
-    usage("rig import is not in this build")
+    usage("rig import is not in this build").into()
 }
 
 /// Runs `graspd rig export`.
 pub fn export_rig(_request: &ExportRequest) -> Outcome {
-    usage("rig export is not in this build")
+    usage("rig export is not in this build").into()
 }
 
 /// Runs `graspd rig show`.
 pub fn show_rig(_rig: &Path) -> Outcome {
-    usage("rig show is not in this build")
+    usage("rig show is not in this build").into()
 }
