@@ -221,7 +221,7 @@ fn figures(c: &Collected, k: &Calibration, notes: &[String]) -> Value {
     json!({
         "status": "done", "verdict": k.verdict.grade.word(), "text": k.verdict.text,
         "pairs": { "files": c.files, "found": c.pairs.len(), "used": k.used.iter().map(|p| &p.name).collect::<Vec<_>>(),
-            "missing": c.missing, "left_out": k.left_out.iter().map(|l| json!({ "name": l.name, "kind": l.kind, "reason": l.reason })).collect::<Vec<_>>() },
+            "rise": k.tests.iter().map(|t| t.rise).collect::<Vec<_>>(), "missing": c.missing, "left_out": k.left_out.iter().map(|l| json!({ "name": l.name, "kind": l.kind, "reason": l.reason })).collect::<Vec<_>>() },
         "left": camera(&rig.left, 0), "right": camera(&rig.right, 12), "R": rows, "T_mm": [t.x, t.y, t.z],
         "fit": { "rms_px": k.fit.rms_px(), "noise_scale": k.fit.noise.scale, "noise_floor_px": k.fit.noise.floor_px,
             "outliers": outliers, "points": points, "bending_mm": k.bending_m[0] * 1e3, "converged": k.fit.converged },

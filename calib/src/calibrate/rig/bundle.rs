@@ -381,8 +381,23 @@ pub struct PoseFit {
     pub information: Matrix6<f64>,
 }
 
+/// Scales of the noise under which a pose is fitted, one after the other: a start that is a pixel off lies beyond the biweight's end.
+const WIDENED: [f64; 3] = [30.0, 5.0, 1.0];
+
 /// Fits a pose with the calibration held; a view that is not to be used is left empty in `pair`.
 pub fn fit_pose(target: &Target, state: &State, noise: &Noise, pair: &Pair, start: &Pose) -> Option<PoseFit> {
+    let mut out = None;
+    let mut pose = *start;
+    for by in WIDENED {
+        let fit = fit_pose_at(target, state, &Noise { scale: noise.scale * by, ..*noise }, pair, &pose)?;
+        pose = fit.pose;
+        out = Some(fit);
+    }
+    out
+}
+
+/// Fits at one scale.
+fn fit_pose_at(target: &Target, state: &State, noise: &Noise, pair: &Pair, start: &Pose) -> Option<PoseFit> {
     let problem = Problem { target, pairs: &[], free: [false; SHARED] };
     let at = |pose: &Pose| {
         let mut n = Normal { cost: 0.0, shared: Shared::zeros(), gradient: SharedStep::zeros(), pairs: Vec::new() };

@@ -12,9 +12,10 @@ use super::parameters::State;
 use crate::calibrate::target::{Seen, Target};
 use graspd_rt::geom::{Pose, View};
 
-/// Rise of chi squared a degree of freedom from which a pair is wrong, in usual rises. Of good pairs with normal noise 1 in 10^13
-/// reaches it; a board moved by its own noise (0.1 px) between the images reaches 20.
-pub const WRONG: f64 = 12.0;
+/// Rise of chi squared a degree of freedom from which a pair is wrong, in usual rises. Of good pairs with normal noise less than 1 in
+/// 10^20 reaches it; a board of 54 points moved by three times their noise between the images reaches 40. The margin is for what
+/// differs between the images of a real set: the usual rise is a median, single pairs are several times above it.
+pub const WRONG: f64 = 20.0;
 /// Median of chi squared with six degrees of freedom, a degree.
 const MEDIAN_6: f64 = 0.891;
 /// Chi squared a degree of freedom of one image alone, in the usual one, from which its points are no flat board of that size.

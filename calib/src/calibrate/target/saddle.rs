@@ -100,8 +100,10 @@ impl Window {
         let to_steps = Matrix2::from_columns(&[along, across]).try_inverse()?;
         let radius = (reach * along.norm().max(across.norm())).clamp(MIN_RADIUS_PX, MAX_RADIUS_PX);
         let (w, h) = (image.width() as f64 - 1.0, image.height() as f64 - 1.0);
-        // A window that the image's border cuts is not symmetric any more.
-        if !(at.x >= radius + 1.0 && at.y >= radius + 1.0 && at.x <= w - radius - 1.0 && at.y <= h - radius - 1.0) {
+        // A window that the image's border cuts is not symmetric any more: it is made smaller.
+        let border = at.x.min(at.y).min(w - at.x).min(h - at.y) - 1.0;
+        let radius = radius.min(border);
+        if !(radius >= MIN_RADIUS_PX) {
             return None;
         }
         let r = radius.ceil() as isize;
