@@ -16,6 +16,10 @@ pub mod parameters;
 pub mod predict;
 pub mod score;
 pub mod solve;
+#[cfg(test)]
+pub(crate) mod synthetic;
+#[cfg(test)]
+mod tests;
 pub mod verdict;
 
 pub use calibration::{Calibration, Options, calibrate};
