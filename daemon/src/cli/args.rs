@@ -50,7 +50,7 @@ pub enum Command {
     /// Calibrate from images of a target, or ask whether a stored calibration is still right
     #[command(subcommand)]
     Calibrate(super::calibrate::CalibrateCommand),
-    /// Read, write and show rig calibrations in the formats of other tools
+    /// What a rig file says, in words
     #[command(subcommand)]
     Rig(super::rig::RigCommand),
     /// The mock UR controller (also a program of its own: graspd-mock-ur)

@@ -1,11 +1,16 @@
 //! `graspd calibrate` and `graspd rig` without the command line: options in, files and figures out, every failure in words.
 
+mod check;
 mod rig;
+mod show;
 
+pub use check::check_rig;
 pub use rig::calibrate_rig;
+pub(in crate::calibrate) use rig::next_words;
+pub use show::show_rig;
 
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// How it went; the daemon's exit codes follow from it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -67,34 +72,6 @@ pub struct CheckRequest {
     pub rig: PathBuf,
 }
 
-/// What `graspd rig import` is asked.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct ImportRequest {
-    /// The other tool's files.
-    pub files: Vec<PathBuf>,
-    /// "auto" or a format's name.
-    pub format: String,
-    /// Unit of the translation.
-    pub unit: Option<String>,
-    /// "WxH".
-    pub size: Option<String>,
-    /// Where to write the rig.
-    pub out: PathBuf,
-}
-
-/// What `graspd rig export` is asked.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct ExportRequest {
-    /// The rig.
-    pub rig: PathBuf,
-    /// A format's name.
-    pub format: String,
-    /// The file to write.
-    pub out: PathBuf,
-    /// Largest accepted loss, pixels.
-    pub accept_loss_px: f64,
-}
-
 /// A failure: how it ended, a word for machines, a sentence for people.
 struct Failure(Answer, &'static str, String);
 
@@ -111,24 +88,4 @@ fn usage(text: impl Into<String>) -> Failure {
 
 fn input(text: impl std::fmt::Display) -> Failure {
     Failure(Answer::Input, "input", text.to_string())
-}
-
-/// Runs `graspd calibrate check`.
-pub fn check_rig(_request: &CheckRequest) -> Outcome {
-    usage("calibrate check is not in this build").into()
-}
-
-/// Runs `graspd rig import`.
-pub fn import_rig(_request: &ImportRequest) -> Outcome {
-    usage("rig import is not in this build").into()
-}
-
-/// Runs `graspd rig export`.
-pub fn export_rig(_request: &ExportRequest) -> Outcome {
-    usage("rig export is not in this build").into()
-}
-
-/// Runs `graspd rig show`.
-pub fn show_rig(_rig: &Path) -> Outcome {
-    usage("rig show is not in this build").into()
 }

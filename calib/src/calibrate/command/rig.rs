@@ -173,8 +173,8 @@ fn words(c: &Collected, k: &Calibration, notes: &[String], out: Option<&Path>) -
         k.fit.rms_px(),
         rms(&k.holdout.reprojection_px)
     ));
-    for (name, reason) in &c.missing {
-        line(format!("not used: {name}: {reason}"));
+    for (_, reason) in &c.missing {
+        line(format!("not used: {reason}"));
     }
     for l in &k.left_out {
         line(format!("left out: {}: {}", l.name, l.reason));

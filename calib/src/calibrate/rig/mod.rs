@@ -7,6 +7,7 @@
 
 pub mod bundle;
 mod calibration;
+pub mod check;
 mod consensus;
 pub mod coverage;
 pub mod holdout;

@@ -14,7 +14,7 @@ pub struct Scores {
     pub squares: Vec<f64>,
     /// Lengths of the target's diagonals against the true ones, less 1.
     pub diagonals: Vec<f64>,
-    /// Points that could have been evaluated: those seen in both images of every pair.
+    /// Points that could have been evaluated: all of the target, or those seen in both images where it may be seen in part.
     pub expected: usize,
     /// Points that were.
     pub evaluated: usize,
@@ -56,8 +56,9 @@ pub fn score(rig: &Rig, target: &Target, pair: &Pair) -> Scores {
     let mut out = Scores::default();
     let f = fundamental(rig);
     let mut places: Vec<Option<Vec3>> = vec![None; target.count()];
+    let mut both_seen = 0;
     for (l, r) in both(&pair.seen[0], &pair.seen[1]) {
-        out.expected += 1;
+        both_seen += 1;
         let (Some(a), Some(b)) = (straight(&rig.left, l.at), straight(&rig.right, r.at)) else { continue };
         let (to_right, to_left) = (f * a.push(1.0), f.tr_mul(&b.push(1.0)));
         let e = b.push(1.0).dot(&to_right);
@@ -68,6 +69,7 @@ pub fn score(rig: &Rig, target: &Target, pair: &Pair) -> Scores {
             *place = triangulate(rig, &f, a, b);
         }
     }
+    out.expected = if target.has_ids() { both_seen } else { target.count() };
     let at = |c: usize, r: usize| {
         let inside = c < target.cols && r < target.rows;
         if inside { places.get(target.index(c, r)).copied().flatten() } else { None }

@@ -150,7 +150,7 @@ fn joint(
 }
 
 /// Gives the right views the direction of the left ones, where the board looks the same when it is turned.
-fn align(target: &Target, pairs: &mut [Pair]) {
+pub(super) fn align(target: &Target, pairs: &mut [Pair]) {
     let turns = target.turns();
     for p in pairs {
         let [left, right] = &mut p.seen;
