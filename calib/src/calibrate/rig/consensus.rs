@@ -45,7 +45,7 @@ pub(super) fn consensus(
             Some((pixel(&x)? - pixel(&y)?).norm_squared())
         });
         let (sum, count) = points.fold((0.0, 0.0), |a, d| (a.0 + d, a.1 + 1.0));
-        if count > 0.0 { (sum / count as f64).sqrt() } else { f64::MAX }
+        if count > 0.0 { (sum / count).sqrt() } else { f64::MAX }
     };
     let of = |k: usize| median((0..pairs.len()).map(|i| distance(i, &relative[k])));
     let best = (0..pairs.len()).min_by(|a, b| of(*a).total_cmp(&of(*b)))?;

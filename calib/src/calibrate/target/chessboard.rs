@@ -20,6 +20,8 @@ const ROW_PART: f64 = 0.6;
 const LEVELS: usize = 3;
 
 type Grid = BTreeMap<(i32, i32), Saddle>;
+/// Corners that were measured outside a grid, with their labels.
+type Row = Vec<((i32, i32), Saddle)>;
 
 /// Finds the chessboard.
 pub(super) fn find(image: &GreyImage, target: &Target) -> Result<Found, NotFound> {
@@ -175,12 +177,7 @@ fn grow(image: &GreyImage, grid: &mut Grid, target: &Target) {
 }
 
 /// The corners of the next row outside, as far as they can be measured and have the right colours; and how many there should be.
-fn outer_row(
-    image: &GreyImage,
-    grid: &Grid,
-    e: (i32, i32, i32, i32),
-    which: usize,
-) -> (Vec<((i32, i32), Saddle)>, usize) {
+fn outer_row(image: &GreyImage, grid: &Grid, e: (i32, i32, i32, i32), which: usize) -> (Row, usize) {
     let (row, (du, dv)) = side(e, which, 1);
     let of = row.len();
     let at = |u: i32, v: i32| grid.get(&(u, v));

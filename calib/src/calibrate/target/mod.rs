@@ -7,6 +7,8 @@ mod collect;
 mod images;
 mod saddle;
 mod spec;
+#[cfg(test)]
+mod tests;
 
 pub use collect::{CollectError, Collected, FoundPair, collect};
 pub use images::{GreyImage, ImageError, ImageFile, list_images, read_image};
