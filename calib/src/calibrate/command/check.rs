@@ -46,6 +46,11 @@ fn outcome(c: &Collected, k: &Check) -> Outcome {
         Standing::Drifted => {
             ("drifted", "the cameras have moved against each other, by less than matters", Answer::Done)
         }
+        Standing::Coarse => (
+            "coarse",
+            "the stored calibration is off by more than matters, though by no more than its file says that it may be: calibrate again",
+            Answer::Refused,
+        ),
         Standing::Changed => (
             "changed",
             "the stored calibration is no longer right: calibrate again, and look for what was knocked or came loose",

@@ -27,6 +27,8 @@ pub enum Standing {
     Drifted,
     /// It is no longer right.
     Changed,
+    /// It is off by more than matters, but by no more than its file says that it may be.
+    Coarse,
 }
 
 /// What came out.
@@ -126,12 +128,13 @@ fn answer(
     let both = own + stored_covariance(stored);
     let chi2 = both.try_inverse().map_or(0.0, |i| motion.dot(&(i * motion)));
     let rms = super::score::rms(&before.epipolar_px);
-    let state = if chi2 < CHANGED {
-        Standing::Holds
-    } else if rms < HARMLESS_PX {
-        Standing::Drifted
-    } else {
-        Standing::Changed
+    let seen = own.try_inverse().map_or(0.0, |i| motion.dot(&(i * motion)));
+    let state = match (chi2 < CHANGED, rms < HARMLESS_PX) {
+        (true, true) => Standing::Holds,
+        (false, true) => Standing::Drifted,
+        (false, false) => Standing::Changed,
+        (true, false) if seen < CHANGED => Standing::Holds,
+        (true, false) => Standing::Coarse,
     };
     Check { state, before, after, motion, chi2, used: pairs.len(), left_out, rig: *rig }
 }
@@ -167,7 +170,14 @@ mod tests {
         assert_eq!((c.state, c.used), (Standing::Holds, 4));
         // A third of a degree: a knock.
         let bent = exp_twist(&Vector6::new(0.0, 0.0, 0.0, 0.006, 0.0, 0.0)) * rig.right_from_left;
-        let c = check(&target, pairs, &RigFile::new(Rig { right_from_left: bent, ..rig })).unwrap();
+        let off = RigFile::new(Rig { right_from_left: bent, ..rig });
+        // A file that states nothing may be off by 0.1 degrees about each axis: nobody knows whether it was ever better.
+        assert_eq!(check(&target, pairs.clone(), &off).unwrap().state, Standing::Coarse);
+        let names = ["x", "y", "z", "rx", "ry", "rz"].map(|n| format!("right_from_left.{n}"));
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        let small = nalgebra::DMatrix::from_diagonal_element(6, 6, 1e-7);
+        let stated = RigFile { covariance: Some(crate::files::RigCovariance::of(&names, &small)), ..off };
+        let c = check(&target, pairs, &stated).unwrap();
         assert_eq!(c.state, Standing::Changed);
         let found = c.motion.fixed_rows::<3>(3).into_owned();
         assert!((found - nalgebra::Vector3::new(-0.006, 0.0, 0.0)).norm() < 5e-4, "{found}");
