@@ -44,5 +44,6 @@
 #![forbid(unsafe_code)]
 
 pub mod commands;
+pub mod calibrate;
 pub mod files;
 pub mod offline;

@@ -49,6 +49,8 @@ fn run(command: Command) -> Result<Exit, Failure> {
         Command::Plan(args) => cli::plan(&args),
         Command::Run(args) => cli::run(&args),
         Command::Check(args) => cli::check(&args),
+        Command::Calibrate(command) => cli::calibrate(&command),
+        Command::Rig(command) => cli::rig(&command),
         Command::Status(args) => cli::send(&args, Verb::Status, b""),
         Command::Arm(args) => cli::send(&args, Verb::Arm, b""),
         Command::Servo(args) => cli::send(&args, Verb::Servo, b""),

@@ -14,6 +14,7 @@ mod outputs;
 mod plan;
 mod pose;
 mod rig;
+mod rig_covariance;
 
 pub use boxes::OrientedBox;
 pub use error::FileError;
@@ -27,3 +28,4 @@ pub use plan::{
 };
 pub use pose::PoseRecord;
 pub use rig::{Quality, RigFile};
+pub use rig_covariance::RigCovariance;

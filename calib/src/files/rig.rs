@@ -3,6 +3,7 @@
 use super::error::{self, FileError, Source};
 use super::hash::{ContentHash, Numbers};
 use super::pose::PoseRecord;
+use super::rig_covariance::RigCovariance;
 use graspd_rt::geom::{Camera, CameraError, Distortion, Rig, RigError};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -20,6 +21,8 @@ pub struct RigFile {
     pub date: Option<String>,
     /// Quality of the calibration.
     pub quality: Option<Quality>,
+    /// Covariance of its parameters, where a calibration left it.
+    pub covariance: Option<RigCovariance>,
 }
 
 /// Quality of a calibration. The standard deviations are those of the rig's error.
@@ -65,6 +68,8 @@ struct Raw {
     right_from_left: PoseRecord,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     quality: Option<Quality>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    covariance: Option<RigCovariance>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -128,12 +133,16 @@ impl RigFile {
         if let Some(q) = &raw.quality {
             stated_error(&src, q)?;
         }
-        Ok(Self { rig: Rig { left, right, right_from_left }, name: raw.name, date: raw.date, quality: raw.quality })
+        if let Some(c) = &raw.covariance {
+            c.check(&src)?;
+        }
+        let rig = Rig { left, right, right_from_left };
+        Ok(Self { rig, name: raw.name, date: raw.date, quality: raw.quality, covariance: raw.covariance })
     }
 
     /// A rig without data about its calibration.
     pub fn new(rig: Rig) -> Self {
-        Self { rig, name: None, date: None, quality: None }
+        Self { rig, name: None, date: None, quality: None, covariance: None }
     }
 
     /// The rig's error as stated in the file; the default for every value that is not stated.
@@ -176,6 +185,7 @@ impl RigFile {
             right: raw_camera(&self.rig.right),
             right_from_left: PoseRecord::of(&self.rig.right_from_left),
             quality: self.quality.clone(),
+            covariance: self.covariance.clone(),
         };
         let body = toml::to_string(&raw).unwrap_or_default();
         format!(

@@ -49,6 +49,12 @@ pub enum Command {
     Bench(BenchArgs),
     /// Check a configuration and every file it names; changes nothing
     Check(RunArgs),
+    /// Calibrate from images of a target, or ask whether a stored calibration is still right
+    #[command(subcommand)]
+    Calibrate(super::calibrate::CalibrateCommand),
+    /// What a rig file says, in words
+    #[command(subcommand)]
+    Rig(super::rig::RigCommand),
     /// The mock UR controller (also a separate program: graspd-mock-ur)
     #[cfg(feature = "demo")]
     #[command(hide = true, disable_help_flag = true)]

@@ -2,6 +2,7 @@
 
 mod args;
 mod bench_track;
+mod calibrate;
 mod client;
 #[cfg(feature = "demo")]
 pub mod demo;
@@ -9,6 +10,7 @@ mod mesh;
 mod mesh_args;
 mod plan;
 mod reconstruct;
+mod rig;
 mod run;
 mod sequence;
 mod simulator;
@@ -19,10 +21,12 @@ pub use args::{
     ReconstructArgs, RunArgs, SetpointArgs, StudyArgs,
 };
 pub use bench_track::bench_track;
+pub use calibrate::{CalibrateCommand, calibrate};
 pub use client::{recover, send, setpoint, stop};
 pub use mesh_args::MeshArgs;
 pub use plan::plan;
 pub use reconstruct::reconstruct;
+pub use rig::{RigCommand, rig};
 pub use run::{check, run};
 pub use simulator::simulator;
 pub use study::study;

@@ -1,0 +1,160 @@
+//! How good a calibration is on pairs that it was not made from: epipolar distance, lengths of squares and diagonals.
+
+use super::Pair;
+use crate::calibrate::target::{Seen, Target};
+use graspd_rt::geom::{Pixel, Rig, Vec3};
+use nalgebra::{Matrix3, Matrix4, Vector2, Vector3};
+
+/// Figures of a set of pairs.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Scores {
+    /// Signed distances from the epipolar lines in both images, pixels of the undistorted image.
+    pub epipolar_px: Vec<f64>,
+    /// Lengths between neighbouring points against the target's, less 1.
+    pub squares: Vec<f64>,
+    /// Lengths of the target's diagonals against the true ones, less 1.
+    pub diagonals: Vec<f64>,
+    /// Points that could have been evaluated: all of the target, or those seen in both images where it may be seen in part.
+    pub expected: usize,
+    /// Points that were.
+    pub evaluated: usize,
+}
+
+impl Scores {
+    /// Adds another set's.
+    pub fn extend(&mut self, other: Scores) {
+        self.epipolar_px.extend(other.epipolar_px);
+        self.squares.extend(other.squares);
+        self.diagonals.extend(other.diagonals);
+        self.expected += other.expected;
+        self.evaluated += other.evaluated;
+    }
+}
+
+/// Root mean square.
+pub fn rms(v: &[f64]) -> f64 {
+    (v.iter().map(|x| x * x).sum::<f64>() / v.len().max(1) as f64).sqrt()
+}
+
+/// Mean.
+pub fn mean(v: &[f64]) -> f64 {
+    v.iter().sum::<f64>() / v.len().max(1) as f64
+}
+
+/// The value that a part of the absolute values does not exceed.
+pub fn quantile(v: &[f64], part: f64) -> f64 {
+    let mut all: Vec<f64> = v.iter().map(|x| x.abs()).collect();
+    all.sort_by(f64::total_cmp);
+    let at = part * (all.len().max(1) - 1) as f64;
+    let (k, f) = (at.floor() as usize, at.fract());
+    let get = |k: usize| all.get(k.min(all.len().saturating_sub(1))).copied().unwrap_or(0.0);
+    get(k) * (1.0 - f) + get(k + 1) * f
+}
+
+/// Scores a rig on one pair.
+pub fn score(rig: &Rig, target: &Target, pair: &Pair) -> Scores {
+    let mut out = Scores::default();
+    let f = fundamental(rig);
+    let mut places: Vec<Option<Vec3>> = vec![None; target.count()];
+    let mut both_seen = 0;
+    for (l, r) in both(&pair.seen[0], &pair.seen[1]) {
+        both_seen += 1;
+        let (Some(a), Some(b)) = (straight(&rig.left, l.at), straight(&rig.right, r.at)) else { continue };
+        let (to_right, to_left) = (f * a.push(1.0), f.tr_mul(&b.push(1.0)));
+        let e = b.push(1.0).dot(&to_right);
+        out.epipolar_px.push(e / to_right.xy().norm());
+        out.epipolar_px.push(e / to_left.xy().norm());
+        out.evaluated += 1;
+        if let Some(place) = places.get_mut(l.index) {
+            *place = triangulate(rig, &f, a, b);
+        }
+    }
+    out.expected = if target.has_ids() { both_seen } else { target.count() };
+    let at = |c: usize, r: usize| {
+        let inside = c < target.cols && r < target.rows;
+        if inside { places.get(target.index(c, r)).copied().flatten() } else { None }
+    };
+    for r in 0..target.rows {
+        for c in 0..target.cols {
+            let Some(here) = at(c, r) else { continue };
+            for next in [at(c + 1, r), at(c, r + 1)].into_iter().flatten() {
+                out.squares.push((here - next).norm() / target.spacing - 1.0);
+            }
+        }
+    }
+    let (n, m, length) = (target.cols - 1, target.rows - 1, target.size().norm());
+    for (a, b) in [(at(0, 0), at(n, m)), (at(0, m), at(n, 0))] {
+        if let (Some(a), Some(b)) = (a, b) {
+            out.diagonals.push((a - b).norm() / length - 1.0);
+        }
+    }
+    out
+}
+
+/// Points that both views see, by index.
+pub fn both<'a>(left: &'a [Seen], right: &'a [Seen]) -> impl Iterator<Item = (&'a Seen, &'a Seen)> {
+    left.iter().filter_map(|l| {
+        let k = right.binary_search_by_key(&l.index, |s| s.index).ok()?;
+        Some((l, right.get(k)?))
+    })
+}
+
+/// The pixel without distortion, on the camera's own grid.
+fn straight(c: &graspd_rt::geom::Camera, p: Pixel) -> Option<Pixel> {
+    c.undistort(p).map(|n| Pixel::new(n.x * c.fx + c.cx, n.y * c.fy + c.cy))
+}
+
+/// Fundamental matrix between the undistorted images: right' F left = 0.
+fn fundamental(rig: &Rig) -> Matrix3<f64> {
+    let k_inverse = |c: &graspd_rt::geom::Camera| {
+        Matrix3::new(1.0 / c.fx, 0.0, -c.cx / c.fx, 0.0, 1.0 / c.fy, -c.cy / c.fy, 0.0, 0.0, 1.0)
+    };
+    let t = rig.right_from_left.translation.vector;
+    let cross = t.cross_matrix();
+    k_inverse(&rig.right).transpose()
+        * cross
+        * rig.right_from_left.rotation.to_rotation_matrix().matrix()
+        * k_inverse(&rig.left)
+}
+
+/// A point from two undistorted pixels: both moved onto a common epipolar plane by the least squares of Lindstrom (2010), then the
+/// intersection of their rays.
+fn triangulate(rig: &Rig, f: &Matrix3<f64>, a: Pixel, b: Pixel) -> Option<Vec3> {
+    let e2 = f.fixed_view::<2, 2>(0, 0).into_owned();
+    let (n0, m0) = ((f * a.push(1.0)).xy(), (f.tr_mul(&b.push(1.0))).xy());
+    let c = b.push(1.0).dot(&(f * a.push(1.0)));
+    let (mut x, mut y) = (a, b);
+    for _ in 0..5 {
+        let n = (f * x.push(1.0)).xy();
+        let m = (f.tr_mul(&y.push(1.0))).xy();
+        // c - 2 lambda half + lambda^2 bend = 0, its smaller root.
+        let bend = n.dot(&(e2 * m));
+        let half = 0.5 * (n.dot(&n0) + m.dot(&m0));
+        let lambda = c / (half + (half * half - bend * c).max(0.0).sqrt());
+        (x, y) = (a - m * lambda, b - n * lambda);
+    }
+    intersect(rig, x, y)
+}
+
+/// The homogeneous linear solution, which is exact for rays that meet.
+fn intersect(rig: &Rig, a: Pixel, b: Pixel) -> Option<Vec3> {
+    let ray = |c: &graspd_rt::geom::Camera, p: Pixel| Vector2::new((p.x - c.cx) / c.fx, (p.y - c.cy) / c.fy);
+    let (l, r) = (ray(&rig.left, a), ray(&rig.right, b));
+    let m: Matrix4<f64> = rig.right_from_left.to_homogeneous();
+    let row = |k: usize| m.row(k).transpose();
+    let eye = Matrix4::<f64>::identity();
+    let rows = [
+        eye.row(2).transpose() * l.x - eye.row(0).transpose(),
+        eye.row(2).transpose() * l.y - eye.row(1).transpose(),
+        row(2) * r.x - row(0),
+        row(2) * r.y - row(1),
+    ];
+    let (mut n, mut rhs) = (Matrix3::zeros(), Vector3::zeros());
+    for r in rows {
+        let v = r.xyz();
+        n += v * v.transpose();
+        rhs -= v * r.w;
+    }
+    let x = n.try_inverse()? * rhs;
+    (x.z > 0.0).then_some(x)
+}
