@@ -43,7 +43,7 @@
 //! ```
 #![forbid(unsafe_code)]
 
-pub mod commands;
 pub mod calibrate;
+pub mod commands;
 pub mod files;
 pub mod offline;

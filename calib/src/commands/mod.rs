@@ -6,7 +6,7 @@
 
 pub mod mesh;
 pub mod plan;
-mod progress;
+pub(crate) mod progress;
 pub mod reconstruct;
 pub mod study;
 

@@ -12,6 +12,10 @@ use std::path::PathBuf;
 pub enum CalibrateCommand {
     /// The stereo rig, from image pairs of a target that is moved by hand
     Rig(Box<CalibrateRigArgs>),
+    /// The gripper at the arm: marks, mounting and the rig's pose, from a recording; moves nothing
+    Gripper(super::calibrate_gripper::CalibrateGripperArgs),
+    /// Record marks and joints whenever the arm is at rest, from a running daemon; moves nothing
+    Record(super::calibrate_gripper::CalibrateRecordArgs),
     /// Is a stored rig calibration still right? From a few image pairs of the target
     Check(CalibrateCheckArgs),
 }
@@ -78,6 +82,8 @@ pub struct CalibrateCheckArgs {
 pub fn calibrate(command: &CalibrateCommand) -> Result<Exit, Failure> {
     match command {
         CalibrateCommand::Rig(args) => rig(args),
+        CalibrateCommand::Gripper(args) => super::calibrate_gripper::gripper(args),
+        CalibrateCommand::Record(args) => super::calibrate_gripper::record(args),
         CalibrateCommand::Check(args) => check(args),
     }
 }

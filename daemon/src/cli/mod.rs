@@ -3,6 +3,7 @@
 mod args;
 mod bench_track;
 mod calibrate;
+mod calibrate_gripper;
 mod client;
 #[cfg(feature = "demo")]
 pub mod demo;

@@ -5,7 +5,7 @@ use crate::calibrate::rig::score::{mean, quantile, rms};
 use crate::calibrate::rig::solve::Lens;
 use crate::calibrate::rig::{Calibration, Options, Pair, calibrate};
 use crate::calibrate::target::{Collected, FoundPair, Target, collect};
-use crate::progress::Progress;
+use crate::commands::progress::Progress;
 use serde_json::{Value, json};
 use std::fmt::Write as _;
 use std::path::Path;

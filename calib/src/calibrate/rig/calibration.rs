@@ -141,7 +141,7 @@ impl Calibration {
         Quality {
             rms_px: Some(self.fit.rms_px()),
             holdout_rms_px: Some(rms(&self.holdout.reprojection_px)),
-            pictures: u32::try_from(self.used.len()).ok(),
+            images: u32::try_from(self.used.len()).ok(),
             rotation_rad: root((variance(27) + variance(28) + variance(29)) / 3.0, 1e-6),
             focal: root(0.25 * (vl + vr + 2.0 * cross), 1e-6),
             focal_difference: root(0.25 * (vl + vr - 2.0 * cross), 1e-6),

@@ -1,0 +1,193 @@
+//! `graspd calibrate gripper` and `graspd calibrate record`.
+
+use super::args::ClientArgs;
+use super::calibrate::finish;
+use crate::arm::read_identity;
+use crate::config::{Config, Kinematics, LinkKind};
+use crate::exit::{Exit, Failure};
+use crate::config::ur_config;
+use clap::Args;
+use graspd_calib::calibrate::gripper::command::{GripperRequest, calibrate_gripper};
+use graspd_calib::calibrate::gripper::{Event, Recorder, Sample};
+use graspd_calib::files::keep_apart;
+use graspd_rt::arm::Dh;
+use graspd_rt::geom::Pixel;
+use graspd_shm::control::{TelemetrySample, TelemetrySubscriber};
+use graspd_shm::create_node;
+use serde_json::{Value, json};
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// Between two looks at the telemetry topic, which has 50 samples a second and keeps eight of them.
+const LOOK: Duration = Duration::from_millis(20);
+/// Without a sample for this long the daemon is gone.
+const SILENCE: Duration = Duration::from_secs(3);
+
+/// `graspd calibrate gripper`.
+#[derive(Debug, Args)]
+pub struct CalibrateGripperArgs {
+    /// The recording: of `graspd calibrate record`, or of the form in docs/CALIBRATION.md
+    #[arg(long, value_name = "FILE.json")]
+    pub data: PathBuf,
+    /// Rig calibration in place of the recording's own; what it states of its own error is the prior
+    #[arg(long, value_name = "rig.toml")]
+    pub rig: Option<PathBuf>,
+    /// Gripper file whose marks and mounting are replaced in --out [default: the one inside the recording]
+    #[arg(long, value_name = "gripper.toml")]
+    pub gripper: Option<PathBuf>,
+    /// How well the task needs the marks to be known against the flange (one sigma), millimetres
+    #[arg(long, value_name = "MM", default_value_t = 1.0)]
+    pub tolerance_mm: f64,
+    /// Where to write the calibrated gripper
+    #[arg(long, value_name = "gripper.toml")]
+    pub out: Option<PathBuf>,
+    /// Where to write the rig, where the images say that it is off
+    #[arg(long, value_name = "rig.toml")]
+    pub rig_out: Option<PathBuf>,
+    /// One JSON object on standard output
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `graspd calibrate record`.
+#[derive(Debug, Args)]
+pub struct CalibrateRecordArgs {
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub client: ClientArgs,
+    /// Where to write the recording; it is complete after every rest
+    #[arg(long, value_name = "FILE.json")]
+    pub out: PathBuf,
+    /// End after this many rests
+    #[arg(long, value_name = "N", default_value_t = 25)]
+    pub rests: usize,
+    /// End after this many seconds
+    #[arg(long, value_name = "S", default_value_t = 3600.0)]
+    pub seconds: f64,
+    /// How well the marks' places in the gripper file are known (one sigma), millimetres [default: estimated]
+    #[arg(long, value_name = "MM")]
+    pub marks_mm: Option<f64>,
+}
+
+/// Runs `graspd calibrate gripper`.
+pub(super) fn gripper(args: &CalibrateGripperArgs) -> Result<Exit, Failure> {
+    let outputs = [("--out", args.out.as_deref()), ("--rig-out", args.rig_out.as_deref())];
+    let inputs = [("--data", Some(args.data.as_path())), ("--rig", args.rig.as_deref())];
+    keep_apart(&outputs, &inputs).map_err(|message| Failure { exit: Exit::Usage, message })?;
+    let outcome = calibrate_gripper(&GripperRequest {
+        data: args.data.clone(),
+        rig: args.rig.clone(),
+        gripper: args.gripper.clone(),
+        tolerance_mm: args.tolerance_mm,
+        out: args.out.clone(),
+        rig_out: args.rig_out.clone(),
+    });
+    finish(args.json, outcome)
+}
+
+/// Runs `graspd calibrate record`.
+pub(super) fn record(args: &CalibrateRecordArgs) -> Result<Exit, Failure> {
+    let usage = |message: &str| Failure { exit: Exit::Usage, message: message.to_owned() };
+    let path = args.client.config.as_deref().ok_or_else(|| {
+        usage("--config is needed: it names the cell, the arm, the rig and the gripper that are recorded")
+    })?;
+    if !(args.seconds > 0.0 && args.seconds <= 86_400.0) || args.rests == 0 || args.rests > 2000 {
+        return Err(usage("--seconds is 0 to 86400 and --rests 1 to 2000"));
+    }
+    if args.marks_mm.is_some_and(|v| !(0.0..=100.0).contains(&v)) {
+        return Err(usage("--marks-mm is a standard deviation from 0 to 100 millimetres"));
+    }
+    let config = Config::load(path)?;
+    let (dh, source) = kinematics(&config)?;
+    let node = create_node(&config.names, "graspd-calibrate-record").map_err(|e| Failure::link(e.to_string()))?;
+    let topic = TelemetrySubscriber::new(&node).map_err(|e| Failure::link(e.to_string()))?;
+    let ended = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        signal_hook::flag::register(signal, Arc::clone(&ended)).map_err(|e| Failure::fault(e.to_string()))?;
+    }
+    say(
+        args,
+        &format!(
+            "recording; kinematics: {source}. Move the arm by hand or pendant, and let it rest 1.5 s at each place."
+        ),
+    );
+    let mut recorder = Recorder::new(dh);
+    let (start, mut heard) = (Instant::now(), Instant::now());
+    while recorder.rests() < args.rests
+        && start.elapsed().as_secs_f64() < args.seconds
+        && !ended.load(Ordering::Relaxed)
+    {
+        while let Some(sample) = topic.next().map_err(|e| Failure::link(e.to_string()))? {
+            heard = Instant::now();
+            match recorder.offer(sample_of(&sample)) {
+                Event::None => {}
+                Event::Passed(why) => say(args, &why),
+                Event::Stored(n, [left, right]) => {
+                    write(args, &config, &recorder)?;
+                    say(args, &format!("rest {n} of {}: {left} marks left, {right} right", args.rests));
+                }
+            }
+        }
+        if heard.elapsed() > SILENCE {
+            return Err(Failure::link(format!(
+                "no telemetry for {} s: is `graspd run` with this configuration running? {} rests are in {}",
+                SILENCE.as_secs(),
+                recorder.rests(),
+                args.out.display()
+            )));
+        }
+        std::thread::sleep(LOOK);
+    }
+    if args.client.json {
+        let done = json!({ "rests": recorder.rests(), "out": args.out.display().to_string(), "kinematics": source });
+        let _ = writeln!(std::io::stdout(), "{done}");
+    }
+    if recorder.rests() == 0 {
+        return Err(Failure::refused("nothing was recorded: no rest with three marks in both images"));
+    }
+    say(args, &format!("{} rests; next: graspd calibrate gripper --data {}", recorder.rests(), args.out.display()));
+    Ok(Exit::Done)
+}
+
+fn say(args: &CalibrateRecordArgs, words: &str) {
+    if !args.client.json {
+        let _ = writeln!(std::io::stdout(), "{words}");
+    }
+}
+
+/// The table that the daemon itself uses, and where it is from.
+fn kinematics(config: &Config) -> Result<(Dh, String), Failure> {
+    match &config.arm.kinematics {
+        Kinematics::File(path, dh) => Ok((**dh, path.display().to_string())),
+        Kinematics::Controller if config.arm.link == LinkKind::Rtde => {
+            let identity = read_identity(&ur_config(config)).map_err(|e| Failure::link(e.to_string()))?;
+            Ok((identity.dh, "the controller's own calibration".to_owned()))
+        }
+        _ => Ok((config.arm.model.dh(), format!("the {}'s published values, some millimetres off", config.arm.model.name()))),
+    }
+}
+
+fn sample_of(t: &TelemetrySample) -> Sample {
+    let count = t.marks[0].len().min(t.mark_count as usize);
+    let seen =
+        |p: &[f32; 2]| (p[0].is_finite() && p[1].is_finite()).then(|| Pixel::new(f64::from(p[0]), f64::from(p[1])));
+    let view = |v: usize| t.marks[v][..count].iter().map(seen).collect();
+    Sample { time_s: t.stamp_ns as f64 * 1e-9, q: t.q, qd: t.qd, marks: [view(0), view(1)] }
+}
+
+/// Writes what there is, through a neighbour and a rename.
+fn write(args: &CalibrateRecordArgs, config: &Config, recorder: &Recorder) -> Result<(), Failure> {
+    let stated: Value = args.marks_mm.map_or_else(|| json!({}), |mm| json!({ "mark_model_mm": mm }));
+    let g = &config.gripper;
+    let marks: Vec<_> = g.gripper.marks.iter().map(|m| m.position).collect();
+    let assumed = Some(&g.gripper.flange_from_gripper);
+    let text = recorder.to_json(&config.rig.rig, &marks, &g.to_toml(), assumed, stated).to_string();
+    let mut part = args.out.as_os_str().to_owned();
+    part.push(".part");
+    let part = Path::new(&part);
+    let done = std::fs::write(part, text).and_then(|()| std::fs::rename(part, &args.out));
+    done.map_err(|e| Failure::input(format!("{}: cannot be written ({e}); choose another place", args.out.display())))
+}
