@@ -3,9 +3,9 @@
 use super::args::ClientArgs;
 use super::calibrate::finish;
 use crate::arm::read_identity;
+use crate::config::ur_config;
 use crate::config::{Config, Kinematics, LinkKind};
 use crate::exit::{Exit, Failure};
-use crate::config::ur_config;
 use clap::Args;
 use graspd_calib::calibrate::gripper::command::{GripperRequest, calibrate_gripper};
 use graspd_calib::calibrate::gripper::{Event, Recorder, Sample};
@@ -166,7 +166,10 @@ fn kinematics(config: &Config) -> Result<(Dh, String), Failure> {
             let identity = read_identity(&ur_config(config)).map_err(|e| Failure::link(e.to_string()))?;
             Ok((identity.dh, "the controller's own calibration".to_owned()))
         }
-        _ => Ok((config.arm.model.dh(), format!("the {}'s published values, some millimetres off", config.arm.model.name()))),
+        _ => Ok((
+            config.arm.model.dh(),
+            format!("the {}'s published values, some millimetres off", config.arm.model.name()),
+        )),
     }
 }
 
