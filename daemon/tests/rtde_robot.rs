@@ -229,9 +229,9 @@ fn messages_name_the_cause_of_a_stop_and_a_recovery_closes_popups() {
     listener.poll();
     // The mock has to accept the connection.
     std::thread::sleep(Duration::from_millis(200));
-    mock.ask(&Command::Script { text: "def broken():\n  nothing_of_this_name()\nend\n".into() }).unwrap();
+    mock.ask(&Command::Script { text: "def broken():\n  a = [1, 2]\n  b = a[7]\nend\n".into() }).unwrap();
     let text = receive_message(&mut listener, MessageKind::Program);
-    assert!(text.contains("line 2"), "{text}");
+    assert!(text.contains("line 3"), "{text}");
     mock.ask(&Command::Script { text: "popup(\"look here\", title=\"Stop\")\n".into() }).unwrap();
     std::thread::sleep(Duration::from_millis(100));
     mock.ask(&Command::Collision { force: 80.0 }).unwrap();

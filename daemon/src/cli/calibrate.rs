@@ -1,10 +1,10 @@
 //! `graspd calibrate`: one subcommand a thing that is calibrated, and one that asks whether a calibration still holds.
 
+use super::answer::finish;
 use crate::exit::{Exit, Failure};
 use clap::{Args, Subcommand};
-use graspd_calib::calibrate::command::{self, Answer, Outcome};
+use graspd_calib::calibrate::command;
 use graspd_calib::files::keep_apart;
-use std::io::Write as _;
 use std::path::PathBuf;
 
 /// What can be calibrated.
@@ -114,20 +114,4 @@ fn check(args: &CalibrateCheckArgs) -> Result<Exit, Failure> {
         rig: args.rig.clone(),
     });
     finish(args.pairs.json, outcome)
-}
-
-/// Prints the answer; how it ended says with which code the program ends.
-pub(super) fn finish(json: bool, outcome: Outcome) -> Result<Exit, Failure> {
-    if json {
-        let _ = writeln!(std::io::stdout(), "{}", outcome.json);
-    } else if outcome.answer == Answer::Done {
-        let _ = writeln!(std::io::stdout(), "{}", outcome.text);
-    }
-    let exit = match outcome.answer {
-        Answer::Done => return Ok(Exit::Done),
-        Answer::Refused => Exit::NotConverged,
-        Answer::Usage => Exit::Usage,
-        Answer::Input => Exit::Input,
-    };
-    Err(Failure { exit, message: outcome.text })
 }

@@ -1,7 +1,7 @@
 //! `graspd calibrate gripper` and `graspd calibrate record`.
 
-use super::args::ClientArgs;
-use super::calibrate::finish;
+use super::answer::finish;
+use super::client_args::ClientArgs;
 use crate::arm::read_identity;
 use crate::config::ur_config;
 use crate::config::{Config, Kinematics, LinkKind};

@@ -1,6 +1,7 @@
 //! The subcommands that send a request to a running daemon.
 
-use super::args::{ClientArgs, SetpointArgs};
+use super::args::SetpointArgs;
+use super::client_args::ClientArgs;
 use crate::config::Config;
 use crate::exit::{Exit, Failure};
 use crate::realtime::now_ns;

@@ -1,10 +1,12 @@
 //! The command line: one file a subcommand.
 
+mod answer;
 mod args;
 mod bench_track;
 mod calibrate;
 mod calibrate_gripper;
 mod client;
+mod client_args;
 #[cfg(feature = "demo")]
 pub mod demo;
 mod mesh;
@@ -18,12 +20,13 @@ mod simulator;
 mod study;
 
 pub use args::{
-    BenchArgs, BenchCommand, BenchTrackArgs, Cli, ClientArgs, Command, DemoArgs, GripperArgs, PassThrough, PlanArgs,
+    BenchArgs, BenchCommand, BenchTrackArgs, Cli, Command, DemoArgs, GripperArgs, PassThrough, PlanArgs,
     ReconstructArgs, RunArgs, SetpointArgs, StudyArgs,
 };
 pub use bench_track::bench_track;
 pub use calibrate::{CalibrateCommand, calibrate};
 pub use client::{recover, send, setpoint, stop};
+pub use client_args::ClientArgs;
 pub use mesh_args::MeshArgs;
 pub use plan::plan;
 pub use reconstruct::reconstruct;

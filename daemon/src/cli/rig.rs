@@ -1,6 +1,6 @@
 //! `graspd rig`: what a rig file says.
 
-use super::calibrate::finish;
+use super::answer::finish;
 use crate::exit::{Exit, Failure};
 use clap::{Args, Subcommand};
 use graspd_calib::calibrate::command;

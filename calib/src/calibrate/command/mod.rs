@@ -6,7 +6,6 @@ mod show;
 
 pub use check::check_rig;
 pub use rig::calibrate_rig;
-pub(in crate::calibrate) use rig::next_words;
 pub use show::show_rig;
 
 use serde_json::{Value, json};

@@ -182,7 +182,7 @@ fn words(c: &Collected, k: &Calibration, notes: &[String], out: Option<&Path>) -
     for w in k.verdict.warnings.iter().chain(notes) {
         line(format!("note: {w}"));
     }
-    line(next_words(k));
+    line(k.next_text());
     line(format!("verdict: {}", k.verdict.text));
     match out {
         Some(path) => line(format!("written: {}", path.display())),
@@ -190,20 +190,6 @@ fn words(c: &Collected, k: &Calibration, notes: &[String], out: Option<&Path>) -
     }
     t.pop();
     t
-}
-
-/// Which image to take next, or that none is needed.
-pub(in crate::calibrate) fn next_words(k: &Calibration) -> String {
-    match &k.next {
-        Some(n) if k.verdict.more_helps => format!(
-            "next: the target {}; that lowers the marks' error by {:.0} %",
-            n.text,
-            100.0 * (1.0 - n.factor).max(0.0)
-        ),
-        Some(_) | None => {
-            "next: no further image is needed; one more lowers the marks' error by less than 3 %".to_owned()
-        }
-    }
 }
 
 fn figures(c: &Collected, k: &Calibration, notes: &[String]) -> Value {

@@ -3,7 +3,6 @@
 
 mod maps;
 
-use super::command::next_words;
 use super::rig::Calibration;
 use super::rig::score::{mean, quantile, rms};
 use super::target::{Collected, Target};
@@ -36,7 +35,7 @@ pub fn html(target: &Target, collected: &Collected, k: &Calibration) -> String {
     for w in &k.verdict.warnings {
         let _ = write!(h, "<p class=note>{}</p>", escape(w));
     }
-    let _ = write!(h, "<p>{}</p>", escape(&next_words(k)));
+    let _ = write!(h, "<p>{}</p>", escape(&k.next_text()));
     figures(&mut h, k);
     h += "<h2>Residuals, 50 times enlarged</h2><div class=two>";
     for v in 0..2 {

@@ -115,6 +115,20 @@ fn typical(pairs: &[Pair]) -> Matrix2<f64> {
 }
 
 impl Calibration {
+    /// Which image to take next, or that none is needed, as a sentence.
+    pub fn next_text(&self) -> String {
+        match &self.next {
+            Some(n) if self.verdict.more_helps => format!(
+                "next: the target {}; that lowers the marks' error by {:.0} %",
+                n.text,
+                100.0 * (1.0 - n.factor).max(0.0)
+            ),
+            Some(_) | None => {
+                "next: no further image is needed; one more lowers the marks' error by less than 3 %".to_owned()
+            }
+        }
+    }
+
     /// The rig file.
     pub fn file(&self, rational: bool, date: Option<String>) -> RigFile {
         let cov = &self.fit.covariance;
