@@ -1,4 +1,5 @@
-//! The fit of marks to grey values against rendered truth: at the bound, with an honest covariance, over sizes, blurs and motions.
+//! The fit of marks to grey values against rendered truth: at the bound, with an honest covariance, over sizes, blurs
+//! and motions.
 #![allow(clippy::unwrap_used)] // a test, bench or example
 
 mod support;
@@ -76,8 +77,8 @@ fn series(case: Case, n: usize, seed: u64) -> (f64, f64, usize) {
     ((squares / n).sqrt(), normalised / n, found)
 }
 
-/// The Cramer-Rao bound of a coordinate for a disc of this radius, levels known: per unit of rim the information is the integral
-/// of the squared profile of the smeared edge, and half of it is along either axis.
+/// The Cramer-Rao bound of a coordinate for a disc of this radius, levels known: per unit of rim the information is the
+/// integral of the squared profile of the smeared edge, and half of it is along either axis.
 fn bound(case: &Case) -> f64 {
     let variance = case.blur * case.blur + 1.0 / 12.0;
     let information = 1.0 / (2.0 * (std::f64::consts::PI * variance).sqrt());

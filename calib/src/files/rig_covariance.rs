@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 /// Covariance of the calibrated parameters: standard deviations and correlations, so that people can read it.
 ///
-/// Names are those of `rig.toml` ("left.fx", "right.k1"), and "right_from_left.x .. rz" for a small motion of the right camera in its
-/// own frame (metres, radians): x_right = exp(twist) right_from_left x_left.
+/// Names are those of `rig.toml` ("left.fx", "right.k1"), and "right_from_left.x .. rz" for a small motion of the right
+/// camera in its own frame (metres, radians): x_right = exp(twist) right_from_left x_left.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RigCovariance {

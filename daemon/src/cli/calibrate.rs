@@ -56,7 +56,8 @@ pub struct CalibrateRigArgs {
     /// Lens model: brown (k1 k2 p1 p2 k3) or rational (k4 k5 k6 as well)
     #[arg(long, value_name = "MODEL", default_value = "brown", value_parser = ["brown", "rational"])]
     pub lens: String,
-    /// Distance from the left camera at which the task's marks will be, NEAR,FAR in metres [default: that of the target]
+    /// Distance from the left camera at which the task's marks will be, NEAR,FAR in metres [default: that of the
+    /// target]
     #[arg(long, value_name = "NEAR,FAR")]
     pub volume: Option<String>,
     /// Error of a mark's place that the task tolerates, millimetres

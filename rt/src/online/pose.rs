@@ -1,7 +1,8 @@
 //! Gripper pose from the marks of both views, or of one: robust weighted reprojection error, a fixed number of steps.
 //!
-//! The unknown is a small gripper-frame screw `xi = [v; ω]`, `left_from_gripper <- left_from_gripper * exp(xi)`; in that frame the
-//! derivative of a mark's position is the same whatever the pose, and the covariance is what the command side wants.
+//! The unknown is a small gripper-frame screw `xi = [v; ω]`, `left_from_gripper <- left_from_gripper * exp(xi)`; in
+//! that frame the derivative of a mark's position is the same whatever the pose, and the covariance is what the command
+//! side wants.
 
 use super::MarkObservation;
 use crate::geom::{Pixel, Pose, Rig, Twist, Vec3, View, exp_twist};
@@ -17,11 +18,11 @@ pub type MarkTable = [[Option<MarkObservation>; MAX_MARKS]; 2];
 pub struct PoseSettings {
     /// Gauss-Newton steps of the robust stage. Default 10.
     pub steps: u32,
-    /// A mark farther from its prediction than this many of its sigmas (of the marks' own spread, if that is larger) is dropped.
-    /// Default 5.
+    /// A mark farther from its prediction than this many of its sigmas (of the marks' own spread, if that is larger) is
+    /// dropped. Default 5.
     pub gate_sigmas: f64,
-    /// A mark within this distance of its prediction is never dropped, pixels: a rig whose calibration is slightly wrong moves
-    /// all marks of a view, and none of them is at fault. Default 0.5.
+    /// A mark within this distance of its prediction is never dropped, pixels: a rig whose calibration is slightly
+    /// wrong moves all marks of a view, and none of them is at fault. Default 0.5.
     pub gate_floor_px: f64,
 }
 
@@ -94,7 +95,8 @@ struct Observation {
 
 type Observations = heapless::Vec<Observation, { 2 * MAX_MARKS }>;
 
-/// One observation's error (measured minus predicted, pixels) and the derivative of its prediction by the gripper-frame screw.
+/// One observation's error (measured minus predicted, pixels) and the derivative of its prediction by the gripper-frame
+/// screw.
 fn linearize(rig: &Rig, pose: &Pose, o: &Observation) -> Option<(Vector2<f64>, Matrix2x6<f64>)> {
     let view_from_gripper = rig.view_from_left(o.view) * pose;
     let x = (view_from_gripper * Point3::from(o.point)).coords;
@@ -182,7 +184,8 @@ struct Sums {
     longest2: f64,
 }
 
-/// Plain weighted Gauss-Newton from a prediction: the pose, if it converges at once and no mark is near the outlier gate.
+/// Plain weighted Gauss-Newton from a prediction: the pose, if it converges at once and no mark is near the outlier
+/// gate.
 fn track(rig: &Rig, all: &Observations, start: &Pose, settings: &PoseSettings) -> Option<PoseEstimate> {
     let mut pose = *start;
     for _ in 0..PLAIN_STEPS {
@@ -225,7 +228,8 @@ fn track(rig: &Rig, all: &Observations, start: &Pose, settings: &PoseSettings) -
     None
 }
 
-/// Normal equations and errors at a pose: [`linearize`] with everything that the observations of a view share worked out once.
+/// Normal equations and errors at a pose: [`linearize`] with everything that the observations of a view share worked
+/// out once.
 fn sums(rig: &Rig, pose: &Pose, all: &Observations) -> Option<Sums> {
     let placed = View::BOTH.map(|view| {
         let p = rig.view_from_left(view) * pose;

@@ -39,8 +39,8 @@ pub struct VisionSettings {
     pub max_residual_px: f64,
     /// The rig's stated error, and when it counts as changed.
     pub rig: RigWatchSettings,
-    /// How long the cameras expose, seconds: marks are smeared along their predicted motion. Default 0, which takes images for
-    /// sharp; a smear of less than half a pixel makes no difference.
+    /// How long the cameras expose, seconds: marks are smeared along their predicted motion. Default 0, which takes
+    /// images for sharp; a smear of less than half a pixel makes no difference.
     pub exposure_s: f64,
     /// Fewest different marks that make a pose worth having: three determine one, but then nothing says that one of
     /// them is wrong. Default 4.
@@ -223,8 +223,9 @@ impl VisionCycle {
     /// has no marks, a pose that means nothing, and a covariance of a million.
     ///
     /// # Errors
-    /// [`FrameReject`] when the pair, or the pose found in it, is not to be believed. The caller publishes nothing then, so that the
-    /// last result ages; a *seen* loss of the marks is no error but a [`Vision`] with status [`VisionStatus::Lost`].
+    /// [`FrameReject`] when the pair, or the pose found in it, is not to be believed. The caller publishes nothing
+    /// then, so that the last result ages; a *seen* loss of the marks is no error but a [`Vision`] with status
+    /// [`VisionStatus::Lost`].
     pub fn step(&mut self, frame: &StereoFrame<'_>, base_from_gripper: Option<Pose>) -> Result<Vision, FrameReject> {
         self.step_in_stages(frame, base_from_gripper, |_| {})
     }
@@ -316,7 +317,8 @@ impl VisionCycle {
 
     /// Measures every mark that `pose` puts before a camera and that `table` does not hold yet.
     ///
-    /// An error of the prediction moves the marks of a view nearly alike: each is looked for where those before it were.
+    /// An error of the prediction moves the marks of a view nearly alike: each is looked for where those before it
+    /// were.
     fn measure(&mut self, frame: &StereoFrame<'_>, pose: &Pose, motion: &Pose, search_px: f64, table: &mut MarkTable) {
         let Self { rig, gripper, settings, meter, blur, .. } = self;
         for view in View::BOTH {

@@ -1,5 +1,5 @@
-//! Time of the off-line stage from two clicks to a plan on rendered images of 1280x1024, stage by stage:
-//! `cargo bench -p graspd-hil --bench plan`. Measures the processor time of one thread, so that the load of the host does not
+//! Time of the off-line stage from two clicks to a plan on rendered images of 1280x1024, stage by stage: `cargo bench
+//! -p graspd-hil --bench plan`. Measures the processor time of one thread, so that the load of the host does not
 //! matter. Only prints; asserts nothing.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 

@@ -11,12 +11,12 @@ pub(crate) const CONTROLLER_FIFO: u8 = 92;
 /// SCHED_FIFO priority of the thread that samples the joints for the images.
 pub(crate) const EXPOSURE_FIFO: u8 = 90;
 
-/// Niceness of the renderer. It uses a third of a processor. The kernel stops *all* real-time threads of a processor for
-/// 50 ms when they use more than 95 % of a second, so the renderer only gets a priority among ordinary programs.
+/// Niceness of the renderer. It uses a third of a processor. The kernel stops *all* real-time threads of a processor
+/// for 50 ms when they use more than 95 % of a second, so the renderer only gets a priority among ordinary programs.
 pub(crate) const RENDERER_NICE: i32 = -10;
 
-/// Requests a niceness for this process. With session autogrouping the kernel schedules sessions against each other, so the
-/// process first becomes a session leader.
+/// Requests a niceness for this process. With session autogrouping the kernel schedules sessions against each other, so
+/// the process first becomes a session leader.
 pub(crate) fn prefer_this_process(nice: i32) {
     let _ = rustix::process::setsid();
     let own_session = rustix::process::getsid(None).is_ok_and(|s| s == rustix::process::getpid());

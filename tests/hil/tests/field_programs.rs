@@ -1,5 +1,6 @@
-//! Programs in the form that PolyScope saves and that users upload: headers, several statements a line, strings, structs, remote
-//! calls, interpreter mode, force mode, blends. The inputs in data/programs were written for this project.
+//! Programs in the form that PolyScope saves and that users upload: headers, several statements a line, strings,
+//! structs, remote calls, interpreter mode, force mode, blends. The inputs in data/programs were written for this
+//! project.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command, Hosted, MessageKind, Robot, RuntimeState, Setup, Upload};
@@ -246,7 +247,8 @@ fn a_blend_radius_rounds_the_corner_without_a_stop() {
     assert!((1e-4..0.02).contains(&round) && moving > 0.04 && short < long, "{round} m, {moving} m/s, {short} {long}");
 }
 
-/// An XML-RPC server that answers `set_title` with true, `get_width` with twice its argument, and everything else with a fault.
+/// An XML-RPC server that answers `set_title` with true, `get_width` with twice its argument, and everything else with
+/// a fault.
 fn rpc_server() -> u16 {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();

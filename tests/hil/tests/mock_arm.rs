@@ -1,4 +1,5 @@
-//! The robot on a virtual clock: the daemon's control script, its watchdog, every stop, and the RTDE session byte by byte.
+//! The robot on a virtual clock: the daemon's control script, its watchdog, every stop, and the RTDE session byte by
+//! byte.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command, RobotMode, Rule, RuntimeState, SafetyMode, Setup, Upload};

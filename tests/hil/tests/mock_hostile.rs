@@ -1,5 +1,5 @@
-//! The program `graspd-mock-ur` as a separate process with hostile clients: slow ones, ones that reset, ones that never read,
-//! and a thousand reconnects. Its open files, threads and memory are measured from outside.
+//! The program `graspd-mock-ur` as a separate process with hostile clients: slow ones, ones that reset, ones that never
+//! read, and a thousand reconnects. Its open files, threads and memory are measured from outside.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use serde_json::Value as Json;

@@ -1,4 +1,5 @@
-//! The mock controller over real sockets: hostile clients, slow clients, a thousand reconnects, a client that dies in motion.
+//! The mock controller over real sockets: hostile clients, slow clients, a thousand reconnects, a client that dies in
+//! motion.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command, Entry, Hosted, Setup, judge_record, now_ns, read_record};
@@ -319,7 +320,8 @@ fn the_wire_record_shows_that_the_arm_stops_when_its_client_is_killed() {
     assert_eq!(summary.episode_count, 5, "{:?}", summary.episodes);
     assert_eq!(summary.limit_violations, 0, "{:?}", summary.violations);
     for e in &summary.episodes {
-        // Watchdog of 50 ms, ramp of 4 rad/s^2, lag of the drives, and the delay of the host according to the record's clock.
+        // Watchdog of 50 ms, ramp of 4 rad/s^2, lag of the drives, and the delay of the host according to the record's
+        // clock.
         let late = record_lateness(&record);
         let bound = 0.050 + e.peak_rate / 4.0 + 0.030 + late;
         assert!(e.stop_ns().unwrap() as f64 * 1e-9 <= bound, "{e:?}, host late by {late}");

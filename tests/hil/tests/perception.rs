@@ -1,5 +1,5 @@
-//! The tracker on rendered images, compared with ground truth: acquisition at the start and before the valve, tracking on the
-//! path.
+//! The tracker on rendered images, compared with ground truth: acquisition at the start and before the valve, tracking
+//! on the path.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::scenario::{Options, STANDOFF_M, Scenario};

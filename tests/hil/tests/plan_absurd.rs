@@ -1,9 +1,9 @@
 //! Wrong and absurd selections: at most 1 in 1000 may give a wrong plan, and none may panic.
 //!
-//! A few hundred by default; the complete test is
-//! `GRASPD_SELECTIONS=10000 cargo test --release -p graspd-hil --test plan_absurd -- --nocapture`, on other cells with
-//! `GRASPD_FIRST_SEED=1001`. `GRASPD_RIG_ERROR=0.5,0.1` gives a rig with errors of 0.5 % of the focal length and 0.1 degrees: an
-//! answer is then correct if it is one of the scene's circles as reconstructed with that rig.
+//! A few hundred by default; the complete test is `GRASPD_SELECTIONS=10000 cargo test --release -p graspd-hil --test
+//! plan_absurd -- --nocapture`, on other cells with `GRASPD_FIRST_SEED=1001`. `GRASPD_RIG_ERROR=0.5,0.1` gives a rig
+//! with errors of 0.5 % of the focal length and 0.1 degrees: an answer is then correct if it is one of the scene's
+//! circles as reconstructed with that rig.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default, unreachable_pub, dead_code)] // a test; modules shared with an example
 
 #[path = "../examples/judge_cells/cell.rs"]
@@ -60,8 +60,8 @@ fn cell_of(seed: u64, options: &Options) -> Cell {
     Cell { scenario, images, circles, places }
 }
 
-/// A circle's true place, and that of the best fit to its exact edges with the given rig. The edges of a bar's core circle are the
-/// outlines of the bar.
+/// A circle's true place, and that of the best fit to its exact edges with the given rig. The edges of a bar's core
+/// circle are the outlines of the bar.
 fn places(s: &Scenario, c: &Circle) -> Vec<[Vec3; 2]> {
     let w = &s.stage.wheel;
     let is_bar = c.name == "bar" || (c.name == "rim" && w.paint_width_m == 0.0);
@@ -78,7 +78,8 @@ fn places(s: &Scenario, c: &Circle) -> Vec<[Vec3; 2]> {
     [Some(shape), misled].into_iter().flatten().map(|s| [s.centre, s.normal]).collect()
 }
 
-/// Whether a plan's rim is one of the scene's circles: centre within 5 mm and normal within 3 degrees of one of its places.
+/// Whether a plan's rim is one of the scene's circles: centre within 5 mm and normal within 3 degrees of one of its
+/// places.
 fn is_there(p: &Plan, places: &[[Vec3; 2]]) -> bool {
     let rim = &p.reconstruction.rim;
     places.iter().any(|[centre, normal]| {

@@ -1,8 +1,8 @@
-//! The off-line stage on a few rendered cells of every kind, with every click and rim option, with correct and wrong rigs: no
-//! wrong answer.
+//! The off-line stage on a few rendered cells of every kind, with every click and rim option, with correct and wrong
+//! rigs: no wrong answer.
 //!
-//! Complete table: `cargo run --release -p graspd-hil --example judge_cells`. `GRASPD_CELLS=20` judges more seeds of each kind
-//! here, and `GRASPD_FIRST_SEED=1001` other ones.
+//! Complete table: `cargo run --release -p graspd-hil --example judge_cells`. `GRASPD_CELLS=20` judges more seeds of
+//! each kind here, and `GRASPD_FIRST_SEED=1001` other ones.
 #![allow(clippy::unwrap_used, unreachable_pub, dead_code)] // a test; the modules serve the example as well
 
 #[path = "../examples/judge_cells/cell.rs"]
@@ -40,8 +40,8 @@ fn answers(error: RigError) -> Vec<Answer> {
     out
 }
 
-/// Checks that at most the fraction `most_wrong` of the answers is wrong, and that at least the fraction `least_right` of the
-/// unambiguous questions is answered with the selected rim.
+/// Checks that at most the fraction `most_wrong` of the answers is wrong, and that at least the fraction `least_right`
+/// of the unambiguous questions is answered with the selected rim.
 fn check(answers: &[Answer], most_wrong: f64, least_right: f64) {
     let wrong: Vec<_> = answers
         .iter()

@@ -1,7 +1,7 @@
 //! The off-line stage on rendered images: from one click per image to the rim, compared with ground truth.
 //!
-//! `GRASPD_WORLDS=100` runs more worlds of each kind and prints the 95 % figures (the example `judge_cells` does the same for
-//! every click, rim option and rig error).
+//! `GRASPD_WORLDS=100` runs more worlds of each kind and prints the 95 % figures (the example `judge_cells` does the
+//! same for every click, rim option and rig error).
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_calib::files::RigFile;
@@ -92,7 +92,8 @@ fn the_demo_worlds_are_planned_from_their_own_clicks() {
     assert_eq!(c.len() as u64, total, "every world has to be planned");
     let (c, n) = (percentile(&mut c, 0.95), percentile(&mut n, 0.95));
     eprintln!("demo worlds, 95 %: centre {c:.3} mm, normal {n:.3} degrees");
-    // The remaining error is due to the silhouette of the bar, less than a pixel from the paint on the far side of the rim.
+    // The remaining error is due to the silhouette of the bar, less than a pixel from the paint on the far side of the
+    // rim.
     assert!(c <= 0.3 && n <= 0.3, "{c} {n}");
 }
 

@@ -1,5 +1,5 @@
-//! Rendered images against ground truth: drawn cells are usable, discs and circles are at their projections, occlusion is
-//! correct.
+//! Rendered images against ground truth: drawn cells are usable, discs and circles are at their projections, occlusion
+//! is correct.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::scenario::{Options, STANDOFF_M, Scenario, seen_marks};
@@ -97,7 +97,8 @@ fn a_world_is_read_back_unchanged() {
     std::fs::remove_dir_all(&dir).unwrap();
 }
 
-/// Centroid of the dark pixels within `reach` pixels of a position, relative to the brightest grey value there (the plate).
+/// Centroid of the dark pixels within `reach` pixels of a position, relative to the brightest grey value there (the
+/// plate).
 fn centroid(p: &[u8], width: usize, at: Pixel, reach: f64) -> Pixel {
     let n = reach.ceil() as i64 + 1;
     let (x, y) = (at.x.round() as i64, at.y.round() as i64);

@@ -1,5 +1,6 @@
-//! The communication of UR's C++ driver, in its order, with a similar control script: RTDE with its recipes, the dashboard, the
-//! primary interface, and a script that connects back and receives a stream. Real sockets; every wait is bounded.
+//! The communication of UR's C++ driver, in its order, with a similar control script: RTDE with its recipes, the
+//! dashboard, the primary interface, and a script that connects back and receives a stream. Real sockets; every wait is
+//! bounded.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command, Hosted, Setup};

@@ -1,5 +1,5 @@
-//! The documents, held against the code: paths and links exist, every fault code is documented and no other, modules named by
-//! PAPER.md are there.
+//! The documents, held against the code: paths and links exist, every fault code is documented and no other, modules
+//! named by PAPER.md are there.
 #![allow(clippy::unwrap_used)] // a test: a failure must be visible immediately
 
 use std::collections::BTreeSet;

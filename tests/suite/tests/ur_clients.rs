@@ -1,5 +1,6 @@
-//! Third-party clients from PyPI against the mock controller: SDU's ur_rtde, UR's own Python RTDE client as contained in two
-//! packages, a dashboard client, and a client that sends single script lines. In addition a client in plain Python.
+//! Third-party clients from PyPI against the mock controller: SDU's ur_rtde, UR's own Python RTDE client as contained
+//! in two packages, a dashboard client, and a client that sends single script lines. In addition a client in plain
+//! Python.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 use graspd_hil::controller::{Command as Order, Hosted, Setup};

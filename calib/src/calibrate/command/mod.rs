@@ -1,4 +1,5 @@
-//! `graspd calibrate` and `graspd rig` without the command line: options in, files and figures out, every failure in words.
+//! `graspd calibrate` and `graspd rig` without the command line: options in, files and figures out, every failure in
+//! words.
 
 mod check;
 mod rig;

@@ -1,5 +1,5 @@
-//! The report of a calibration as one page: verdict, figures, residuals, coverage, uncertainty over the image, each pair. One file, no
-//! network.
+//! The report of a calibration as one page: verdict, figures, residuals, coverage, uncertainty over the image, each
+//! pair. One file, no network.
 
 mod maps;
 

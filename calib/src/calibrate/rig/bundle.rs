@@ -1,10 +1,10 @@
-//! The joint fit: all target points of all pairs in both views, weighted by their covariances, robust, with the covariance of what
-//! comes out.
+//! The joint fit: all target points of all pairs in both views, weighted by their covariances, robust, with the
+//! covariance of what comes out.
 //!
-//! A point's residual has the covariance s² (C + t² I): C is what the detector says, t what it cannot know (print, paper, compression),
-//! s a common factor; s and t are estimated. Gross errors are held off by Tukey's biweight, which is a maximum-likelihood weight of
-//! nearly 1 for all that is noise and 0 for what is not; nothing else is thrown away here. Poses are eliminated (Schur), so that the
-//! work grows with the number of pairs only linearly.
+//! A point's residual has the covariance s² (C + t² I): C is what the detector says, t what it cannot know (print,
+//! paper, compression), s a common factor; s and t are estimated. Gross errors are held off by Tukey's biweight, which
+//! is a maximum-likelihood weight of nearly 1 for all that is noise and 0 for what is not; nothing else is thrown away
+//! here. Poses are eliminated (Schur), so that the work grows with the number of pairs only linearly.
 
 use super::Pair;
 use super::parameters::{BEND, BENDING, SHARED, SharedStep, State, project, renormalised};
@@ -14,7 +14,8 @@ use nalgebra::{Matrix2, Matrix6, SMatrix, Vector2, Vector6};
 
 /// End of the biweight, standard deviations: a normal residual is beyond it once in 65 million points.
 pub const BIWEIGHT_END: f64 = 6.0;
-/// One standard deviation of how far a board is bent, as a part of its diagonal: a clamped sheet of glass has less, cardboard more.
+/// One standard deviation of how far a board is bent, as a part of its diagonal: a clamped sheet of glass has less,
+/// cardboard more.
 const BEND_PART: f64 = 1e-3;
 /// Rounds of noise and fit; each is a handful of steps.
 const ROUNDS: usize = 12;
@@ -305,7 +306,8 @@ pub fn fit(problem: &Problem<'_>, start: State) -> Option<Fit> {
     for round in 0..ROUNDS {
         let before = noise;
         let rough = median_scale(&all) * noise.scale;
-        // Far from the minimum residuals are no noise: their median sets the scale until most of them are within reach of it.
+        // Far from the minimum residuals are no noise: their median sets the scale until most of them are within reach
+        // of it.
         noise = if round < 3 {
             Noise { scale: rough.max(1e-6), ..noise }
         } else {
@@ -349,7 +351,8 @@ pub fn covariance(information: &Shared, free: &[bool; SHARED]) -> Option<Shared>
     Some(Shared::from_fn(|i, j| if free[i] && free[j] { inverse[(i, j)] * scale[i] * scale[j] } else { 0.0 }))
 }
 
-/// What a pair adds to the information about the shared parameters, its pose unknown, points as seen (weights without outliers).
+/// What a pair adds to the information about the shared parameters, its pose unknown, points as seen (weights without
+/// outliers).
 pub fn pair_information(
     problem: &Problem<'_>,
     state: &State,
@@ -381,7 +384,8 @@ pub struct PoseFit {
     pub information: Matrix6<f64>,
 }
 
-/// Scales of the noise under which a pose is fitted, one after the other: a start that is a pixel off lies beyond the biweight's end.
+/// Scales of the noise under which a pose is fitted, one after the other: a start that is a pixel off lies beyond the
+/// biweight's end.
 const WIDENED: [f64; 3] = [30.0, 5.0, 1.0];
 
 /// Fits a pose with the calibration held; a view that is not to be used is left empty in `pair`.

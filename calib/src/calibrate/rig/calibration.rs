@@ -1,4 +1,5 @@
-//! Everything about a set of pairs: the rig, its covariance, what the held-out pairs say, what it means, and what to do next.
+//! Everything about a set of pairs: the rig, its covariance, what the held-out pairs say, what it means, and what to do
+//! next.
 
 use super::bundle::Fit;
 use super::coverage::Coverage;

@@ -1,5 +1,5 @@
-//! Is a stored calibration still right? A few pairs of the target, the stored rig, and the motion of the right camera that would
-//! explain them better, against what the stored covariance and the points' noise allow.
+//! Is a stored calibration still right? A few pairs of the target, the stored rig, and the motion of the right camera
+//! that would explain them better, against what the stored covariance and the points' noise allow.
 
 use super::bundle::{Problem, fit};
 use super::initial::pose_from_view;
@@ -139,7 +139,8 @@ fn answer(
     Check { state, before, after, motion, chi2, used: pairs.len(), left_out, rig: *rig }
 }
 
-/// Covariance of the stored relative pose: the file's own, or what its quality states, a turn at the baseline's length for the place.
+/// Covariance of the stored relative pose: the file's own, or what its quality states, a turn at the baseline's length
+/// for the place.
 fn stored_covariance(file: &RigFile) -> Matrix6<f64> {
     let names = ["x", "y", "z", "rx", "ry", "rz"].map(|n| format!("right_from_left.{n}"));
     if let Some(c) = &file.covariance {
@@ -171,7 +172,8 @@ mod tests {
         // A third of a degree: a knock.
         let bent = exp_twist(&Vector6::new(0.0, 0.0, 0.0, 0.006, 0.0, 0.0)) * rig.right_from_left;
         let off = RigFile::new(Rig { right_from_left: bent, ..rig });
-        // A file that states nothing may be off by 0.1 degrees about each axis: nobody knows whether it was ever better.
+        // A file that states nothing may be off by 0.1 degrees about each axis: nobody knows whether it was ever
+        // better.
         assert_eq!(check(&target, pairs.clone(), &off).unwrap().state, Standing::Coarse);
         let names = ["x", "y", "z", "rx", "ry", "rz"].map(|n| format!("right_from_left.{n}"));
         let names: Vec<&str> = names.iter().map(String::as_str).collect();

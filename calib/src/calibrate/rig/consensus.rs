@@ -5,8 +5,8 @@ use super::pairs::median;
 use crate::calibrate::target::Target;
 use graspd_rt::geom::{Camera, Pose};
 
-/// Pairs whose relative pose puts the points of the right image this many times farther than the median pair does are not used for
-/// the first joint fit; they are tested again after it.
+/// Pairs whose relative pose puts the points of the right image this many times farther than the median pair does are
+/// not used for the first joint fit; they are tested again after it.
 const FAR: f64 = 4.0;
 /// A disagreement below this is never far, pixels: the two single-camera fits alone differ by that much.
 const NEAR_PX: f64 = 2.0;

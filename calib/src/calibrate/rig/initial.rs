@@ -102,7 +102,8 @@ pub(super) fn homography(target: &Target, seen: &[Seen]) -> Option<Matrix3<f64>>
     out.iter().all(|v| v.is_finite()).then_some(out)
 }
 
-/// Focal lengths from the homographies with the principal point in the middle: the columns of a rotation are orthogonal and equally long.
+/// Focal lengths from the homographies with the principal point in the middle: the columns of a rotation are orthogonal
+/// and equally long.
 fn focal_lengths(homographies: &[Matrix3<f64>], size: (u32, u32)) -> Option<Vector2<f64>> {
     let (cx, cy) = (0.5 * (f64::from(size.0) - 1.0), 0.5 * (f64::from(size.1) - 1.0));
     let centre = Matrix3::new(1.0, 0.0, -cx, 0.0, 1.0, -cy, 0.0, 0.0, 1.0);
@@ -110,7 +111,8 @@ fn focal_lengths(homographies: &[Matrix3<f64>], size: (u32, u32)) -> Option<Vect
     for h in homographies {
         let h = centre * h;
         let (p, q) = (h.column(0).into_owned(), h.column(1).into_owned());
-        // The sum and difference of the columns are as orthogonal as the columns themselves; both equations get one weight.
+        // The sum and difference of the columns are as orthogonal as the columns themselves; both equations get one
+        // weight.
         let n = 1.0 / (p.norm() * q.norm());
         for (p, q) in [(p, q), ((p + q) * 0.5, (p - q) * 0.5)] {
             let row = Vector2::new(p.x * q.x, p.y * q.y) * n;
@@ -140,7 +142,8 @@ fn pose_of(camera: &Camera, h: &Matrix3<f64>) -> Option<Pose> {
     (t.z > 0.0 && t.iter().all(|v| v.is_finite())).then(|| Pose::from_parts(Translation3::from(t), rotation))
 }
 
-/// A board's pose in a calibrated camera from one view, for a start: homography of the points with the distortion removed.
+/// A board's pose in a calibrated camera from one view, for a start: homography of the points with the distortion
+/// removed.
 pub(super) fn pose_from_view(target: &Target, camera: &Camera, seen: &[Seen]) -> Option<Pose> {
     let ideal = Camera { distortion: Distortion::default(), ..*camera };
     let straight: Vec<Seen> =

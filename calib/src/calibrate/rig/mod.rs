@@ -1,9 +1,9 @@
 //! From target points in both views to a calibrated rig that knows its own error.
 //!
-//! [`parameters`]: what is estimated, projection and its derivatives. [`bundle`]: the joint robust fit and its covariance.
-//! [`initial`]: start values. [`pairs`]: which pairs cannot be what they claim to be, and why. [`holdout`] and [`score`]: how good on
-//! images that were not used. [`predict`]: what the covariance means for a mark, and which image would help most. [`coverage`],
-//! [`verdict`]: words. [`calibrate()`]: all of it.
+//! [`parameters`]: what is estimated, projection and its derivatives. [`bundle`]: the joint robust fit and its
+//! covariance. [`initial`]: start values. [`pairs`]: which pairs cannot be what they claim to be, and why. [`holdout`]
+//! and [`score`]: how good on images that were not used. [`predict`]: what the covariance means for a mark, and which
+//! image would help most. [`coverage`], [`verdict`]: words. [`calibrate()`]: all of it.
 
 pub mod bundle;
 mod calibration;

@@ -1,9 +1,9 @@
 //! Which pairs cannot be what they claim to be: one board, at one place, in both images; and why not.
 //!
-//! The test is a likelihood ratio. Each image alone gives a pose of the board; both together, with the rig, give one pose that has to
-//! explain both. What chi squared rises by has six degrees of freedom where the pair is good, whatever the residuals are: a pair that
-//! only fits badly is not left out, and no target for the residuals enters. Where all pairs rise by more (a lens that the model does
-//! not quite describe), the usual rise is the measure.
+//! The test is a likelihood ratio. Each image alone gives a pose of the board; both together, with the rig, give one
+//! pose that has to explain both. What chi squared rises by has six degrees of freedom where the pair is good, whatever
+//! the residuals are: a pair that only fits badly is not left out, and no target for the residuals enters. Where all
+//! pairs rise by more (a lens that the model does not quite describe), the usual rise is the measure.
 
 use super::Pair;
 use super::bundle::{Noise, PoseFit, fit_pose};
@@ -12,13 +12,15 @@ use super::parameters::State;
 use crate::calibrate::target::{Seen, Target};
 use graspd_rt::geom::{Pose, View};
 
-/// Rise of chi squared a degree of freedom from which a pair is wrong, in usual rises. Of good pairs with normal noise less than 1 in
-/// 10^20 reaches it; a board of 54 points moved by three times their noise between the images reaches 40. The margin is for what
-/// differs between the images of a real set: the usual rise is a median, single pairs are several times above it.
+/// Rise of chi squared a degree of freedom from which a pair is wrong, in usual rises. Of good pairs with normal noise
+/// less than 1 in 10^20 reaches it; a board of 54 points moved by three times their noise between the images reaches
+/// 40. The margin is for what differs between the images of a real set: the usual rise is a median, single pairs are
+/// several times above it.
 pub const WRONG: f64 = 20.0;
 /// Median of chi squared with six degrees of freedom, a degree.
 const MEDIAN_6: f64 = 0.891;
-/// Chi squared a degree of freedom of one image alone, in the usual one, from which its points are no flat board of that size.
+/// Chi squared a degree of freedom of one image alone, in the usual one, from which its points are no flat board of
+/// that size.
 const NOT_A_BOARD: f64 = 12.0;
 /// Edges this many times as wide as usual are blurred by motion or focus.
 const BLURRED: f64 = 2.5;
@@ -148,7 +150,8 @@ impl Judge<'_> {
         test(self.target, self.state, &self.noise, pair).is_some_and(|t| self.good(&t))
     }
 
-    /// The pair with its right labels turned as the board looks the same, where that makes it good: no fault, an ambiguity.
+    /// The pair with its right labels turned as the board looks the same, where that makes it good: no fault, an
+    /// ambiguity.
     pub fn turned(&self, pair: &Pair) -> Option<Pair> {
         let mut turns = self.target.turns().into_iter().skip(1);
         turns.find_map(|map| {

@@ -67,8 +67,8 @@ pub struct State {
     pub left_from_board: Vec<Pose>,
 }
 
-/// Bending shapes of the board at a point: quadratic in the coordinates from -1 to 1 over the board, without mean, so that they are
-/// no change of pose.
+/// Bending shapes of the board at a point: quadratic in the coordinates from -1 to 1 over the board, without mean, so
+/// that they are no change of pose.
 pub fn bending_shapes(target: &Target, point: &Vector2<f64>) -> [f64; BEND] {
     let size = target.size();
     let (x, y) = (2.0 * point.x / size.x - 1.0, 2.0 * point.y / size.y - 1.0);
@@ -148,8 +148,9 @@ pub fn camera_jacobian(c: &Camera, n: Normalized) -> (Pixel, Matrix2<f64>, SMatr
     (p, jn, j)
 }
 
-/// Where a camera sees the centroid of a disc's image less where it sees its centre, pixels: the projective and lens bias of circle
-/// targets, by quadrature over the disc. `along` and `across` span the disc's plane, unit length, in the camera's frame.
+/// Where a camera sees the centroid of a disc's image less where it sees its centre, pixels: the projective and lens
+/// bias of circle targets, by quadrature over the disc. `along` and `across` span the disc's plane, unit length, in the
+/// camera's frame.
 pub fn disc_bias(c: &Camera, centre: &Vec3, along: &Vec3, across: &Vec3, radius: f64) -> Option<Vector2<f64>> {
     let at_centre = c.project(centre)?;
     let (mut sum, mut weight) = (Vector2::zeros(), 0.0);

@@ -1,5 +1,5 @@
-//! What the covariance of a rig means for a mark: how far off a triangulated point is, and how far from its epipolar line; and which
-//! image would lower that most.
+//! What the covariance of a rig means for a mark: how far off a triangulated point is, and how far from its epipolar
+//! line; and which image would lower that most.
 
 use super::Pair;
 use super::bundle::{Noise, Problem, Shared, covariance, pair_information};
@@ -59,8 +59,8 @@ pub struct MarkError {
     pub epipolar_px: f64,
 }
 
-/// Derivatives of where a mark is triangulated, and of its distance from the epipolar line, by the shared parameters; its four
-/// image coordinates held.
+/// Derivatives of where a mark is triangulated, and of its distance from the epipolar line, by the shared parameters;
+/// its four image coordinates held.
 fn mark_jacobian(rig: &Rig, x_left: &Vec3) -> Option<(PlaceJacobian, SMatrix<f64, 1, SHARED>)> {
     let mut by_point = Matrix4x3::zeros();
     let mut by_shared = SMatrix::<f64, 4, SHARED>::zeros();
@@ -128,8 +128,8 @@ impl Sensitivity {
     }
 }
 
-/// How far marks move when groups of pairs are left out, as a standard deviation (the jackknife over groups), metres: it knows nothing
-/// of noise models, and so sees what they leave out.
+/// How far marks move when groups of pairs are left out, as a standard deviation (the jackknife over groups), metres:
+/// it knows nothing of noise models, and so sees what they leave out.
 pub fn jackknife_m(rig: &Rig, others: &[Rig], volume: &Volume) -> f64 {
     let g = others.len() as f64;
     let mut sum = 0.0;
@@ -234,7 +234,8 @@ fn candidates(target: &Target, rig: &Rig, volume: &Volume) -> Vec<Candidate> {
     out
 }
 
-/// The pair that would be seen there; `None` where less than the whole target (of one with markers, half) is in both images.
+/// The pair that would be seen there; `None` where less than the whole target (of one with markers, half) is in both
+/// images.
 fn imagined(target: &Target, state: &State, pose: &Pose, typical: &Matrix2<f64>) -> Option<Pair> {
     let view = |v: View| -> Vec<Seen> {
         let camera: &Camera = state.rig.camera(v);

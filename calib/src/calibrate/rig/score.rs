@@ -14,7 +14,8 @@ pub struct Scores {
     pub squares: Vec<f64>,
     /// Lengths of the target's diagonals against the true ones, less 1.
     pub diagonals: Vec<f64>,
-    /// Points that could have been evaluated: all of the target, or those seen in both images where it may be seen in part.
+    /// Points that could have been evaluated: all of the target, or those seen in both images where it may be seen in
+    /// part.
     pub expected: usize,
     /// Points that were.
     pub evaluated: usize,
@@ -117,8 +118,8 @@ fn fundamental(rig: &Rig) -> Matrix3<f64> {
         * k_inverse(&rig.left)
 }
 
-/// A point from two undistorted pixels: both moved onto a common epipolar plane by the least squares of Lindstrom (2010), then the
-/// intersection of their rays.
+/// A point from two undistorted pixels: both moved onto a common epipolar plane by the least squares of Lindstrom
+/// (2010), then the intersection of their rays.
 fn triangulate(rig: &Rig, f: &Matrix3<f64>, a: Pixel, b: Pixel) -> Option<Vec3> {
     let e2 = f.fixed_view::<2, 2>(0, 0).into_owned();
     let (n0, m0) = ((f * a.push(1.0)).xy(), (f.tr_mul(&b.push(1.0))).xy());

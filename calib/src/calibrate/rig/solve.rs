@@ -1,4 +1,5 @@
-//! The whole estimate: each camera alone, consensus, joint fit, and the pairs that do not belong, until nothing changes.
+//! The whole estimate: each camera alone, consensus, joint fit, and the pairs that do not belong, until nothing
+//! changes.
 
 use super::bundle::{Fit, Problem, fit};
 use super::consensus::{Consensus, NO_RIG_PX, consensus};
@@ -104,8 +105,8 @@ fn enough(count: usize) -> Result<(), CalibrateError> {
     if count < LEAST_PAIRS { Err(CalibrateError::TooFew { found: count }) } else { Ok(()) }
 }
 
-/// Leaves out the worst pair that is wrong, takes back those that are good; whether anything changed. One at a time, since a wrong pair
-/// in the fit makes good ones look wrong.
+/// Leaves out the worst pair that is wrong, takes back those that are good; whether anything changed. One at a time,
+/// since a wrong pair in the fit makes good ones look wrong.
 fn revise(judge: &Judge<'_>, pairs: &mut [Pair], used: &mut [bool], tests: &[Option<Test>]) -> bool {
     let mut changed = false;
     for k in 0..pairs.len() {

@@ -36,7 +36,8 @@ fn mahalanobis2(rig: &Rig, s: &Solved) -> (f64, usize) {
     (d.dot(&c.cholesky().unwrap().solve(&d)), rows.len())
 }
 
-/// 95 % regions of all 24 parameters together hold the truth in 95 % of the sets (chi squared with 24 degrees of freedom: 36.415).
+/// 95 % regions of all 24 parameters together hold the truth in 95 % of the sets (chi squared with 24 degrees of
+/// freedom: 36.415).
 #[test]
 fn regions_hold_the_truth_as_often_as_they_say() {
     let (rig, target) = truth();

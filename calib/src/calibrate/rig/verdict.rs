@@ -3,13 +3,14 @@
 use super::pairs::LeftOut;
 use super::predict::MarkError;
 
-/// Part of the tolerance that the calibration may use up before it is called good: a third leaves room for marks and arm.
+/// Part of the tolerance that the calibration may use up before it is called good: a third leaves room for marks and
+/// arm.
 const GOOD_PART: f64 = 1.0 / 3.0;
-/// Factor from one standard deviation of a length in space to what 95 % of the errors stay below: between 1.6 for an error in all
-/// directions and 1.96 for one along the line of sight, which is what a stereo rig has.
+/// Factor from one standard deviation of a length in space to what 95 % of the errors stay below: between 1.6 for an
+/// error in all directions and 1.96 for one along the line of sight, which is what a stereo rig has.
 const P95: f64 = 1.96;
-/// Groups of pairs that disagree this many times more than the noise says tell of something that the model leaves out. Of four
-/// groups with nothing but noise, one set in a thousand disagrees by more.
+/// Groups of pairs that disagree this many times more than the noise says tell of something that the model leaves out.
+/// Of four groups with nothing but noise, one set in a thousand disagrees by more.
 const MODEL_GAP: f64 = 2.3;
 /// An image that lowers the error by less than this part is not worth taking.
 const WORTH: f64 = 0.03;

@@ -1,4 +1,5 @@
-//! A chessboard: the grid by a topological detector, every corner measured anew, labels by the board's size and colours.
+//! A chessboard: the grid by a topological detector, every corner measured anew, labels by the board's size and
+//! colours.
 
 use super::images::GreyImage;
 use super::saddle::{self, Saddle};
@@ -13,8 +14,8 @@ use std::collections::BTreeMap;
 
 /// How far the plain squares reach around a corner, in squares: to the next corner, less its blur.
 const REACH: f64 = 0.45;
-/// Part of a row or column of corners that must be measured before it counts as a row of the board: clutter beside a board has
-/// one or two corners that fit, a row that was only overlooked has nearly all.
+/// Part of a row or column of corners that must be measured before it counts as a row of the board: clutter beside a
+/// board has one or two corners that fit, a row that was only overlooked has nearly all.
 const ROW_PART: f64 = 0.6;
 /// Images are searched at full, half and quarter size: a blurred corner is a sharp one of a smaller image.
 const LEVELS: usize = 3;
@@ -176,7 +177,8 @@ fn grow(image: &GreyImage, grid: &mut Grid, target: &Target) {
     }
 }
 
-/// The corners of the next row outside, as far as they can be measured and have the right colours; and how many there should be.
+/// The corners of the next row outside, as far as they can be measured and have the right colours; and how many there
+/// should be.
 fn outer_row(image: &GreyImage, grid: &Grid, e: (i32, i32, i32, i32), which: usize) -> (Row, usize) {
     let (row, (du, dv)) = side(e, which, 1);
     let of = row.len();

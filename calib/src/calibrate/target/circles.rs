@@ -1,7 +1,7 @@
 //! A grid of dark discs: blobs by a local threshold, centroids of their darkness, labels by walking from disc to disc.
 //!
-//! The centroid is that of the disc's image. It is not the image of the disc's centre; the bundle, which knows pose and lens, predicts
-//! the centroid and so removes the difference.
+//! The centroid is that of the disc's image. It is not the image of the disc's centre; the bundle, which knows pose and
+//! lens, predicts the centroid and so removes the difference.
 
 use super::images::GreyImage;
 use super::spec::Target;
@@ -14,7 +14,8 @@ use std::collections::{BTreeMap, VecDeque};
 const DARKER: f64 = 10.0;
 /// Pixels of the smallest disc: below, its centroid is worse than a tenth of a pixel.
 const LEAST_AREA: usize = 20;
-/// How far the area of an ellipse with a blob's moments may be from the blob's area, relative; a square is off by 5 %, a ring by more.
+/// How far the area of an ellipse with a blob's moments may be from the blob's area, relative; a square is off by 5 %,
+/// a ring by more.
 const ELLIPSE: f64 = 0.12;
 /// How far from where the grid predicts it a disc may be, in steps.
 const NEAR: f64 = 0.3;
@@ -114,8 +115,9 @@ fn nearest(blobs: &[Blob], at: Pixel, without: impl Fn(usize) -> bool) -> Option
         .min_by(|a, b| (blobs[*a].at - at).norm_squared().total_cmp(&(blobs[*b].at - at).norm_squared()))
 }
 
-/// Steps from a blob to its neighbours: the two nearest that lie in different directions, the more horizontal one first. Distances
-/// are measured in the disc's own shape, so that foreshortening does not make a diagonal the shorter way.
+/// Steps from a blob to its neighbours: the two nearest that lie in different directions, the more horizontal one
+/// first. Distances are measured in the disc's own shape, so that foreshortening does not make a diagonal the shorter
+/// way.
 fn first_steps(blobs: &[Blob], seed: usize) -> Option<(Vector2<f64>, Vector2<f64>)> {
     let here = blobs.get(seed)?;
     let shape = here.moments.try_inverse()?;

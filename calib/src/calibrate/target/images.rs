@@ -66,7 +66,8 @@ impl GreyImage {
 pub struct ImageFile {
     /// The image.
     pub grey: GreyImage,
-    /// The file says that its image is to be turned for display (a phone or an editor does that, a camera driver does not).
+    /// The file says that its image is to be turned for display (a phone or an editor does that, a camera driver does
+    /// not).
     pub turned: bool,
 }
 
@@ -93,7 +94,8 @@ pub enum ImageError {
     },
 }
 
-/// The image files that a pattern or a folder names, in the order of their names, numbers by value (`left2` before `left10`).
+/// The image files that a pattern or a folder names, in the order of their names, numbers by value (`left2` before
+/// `left10`).
 ///
 /// # Errors
 /// A pattern that is none, names nothing, or names too much.
@@ -151,8 +153,8 @@ fn natural_key(name: &str) -> Vec<(u128, String)> {
     out
 }
 
-/// Reads an image: colour becomes grey, 16 bits become 8 by the bits that are in use. It is not turned, whatever its tag says: a
-/// calibration belongs to the sensor's rows and columns.
+/// Reads an image: colour becomes grey, 16 bits become 8 by the bits that are in use. It is not turned, whatever its
+/// tag says: a calibration belongs to the sensor's rows and columns.
 ///
 /// # Errors
 /// What is wrong with the file.
@@ -173,7 +175,8 @@ pub fn read_image(path: &Path) -> Result<ImageFile, ImageError> {
     Ok(ImageFile { grey, turned })
 }
 
-/// Eight of sixteen bits: those of the brightest pixel and below, since 10 and 12 bit cameras leave the upper ones empty.
+/// Eight of sixteen bits: those of the brightest pixel and below, since 10 and 12 bit cameras leave the upper ones
+/// empty.
 fn shallow(image: &image::ImageBuffer<image::Luma<u16>, Vec<u16>>) -> Vec<u8> {
     let brightest = image.as_raw().iter().copied().max().unwrap_or(0);
     let shift = (16 - brightest.leading_zeros()).saturating_sub(8);

@@ -86,8 +86,8 @@ pub fn find(image: &GreyImage, target: &Target) -> Result<Found, NotFound> {
     Ok(found)
 }
 
-/// Points without which a view is not used: a board's pose from fewer is hardly redundant (six unknowns, twelve equations at
-/// six points); a chessboard and a circle grid of which half is missing were not found but guessed.
+/// Points without which a view is not used: a board's pose from fewer is hardly redundant (six unknowns, twelve
+/// equations at six points); a chessboard and a circle grid of which half is missing were not found but guessed.
 fn least_points(target: &Target) -> usize {
     match target.kind {
         Kind::Charuco { .. } => 8,

@@ -1,7 +1,8 @@
 //! Where a chessboard corner is, to a hundredth of a pixel: least squares of a blurred corner's grey values.
 //!
-//! The model is m + c tanh(d1 / s) tanh(d2 / s), where d1 and d2 are the distances from the two edges through the corner. It is
-//! symmetric about the corner, and so is the window, so that neither the edges' true profile nor their blur moves it.
+//! The model is m + c tanh(d1 / s) tanh(d2 / s), where d1 and d2 are the distances from the two edges through the
+//! corner. It is symmetric about the corner, and so is the window, so that neither the edges' true profile nor their
+//! blur moves it.
 
 use super::images::GreyImage;
 use graspd_rt::geom::Pixel;
@@ -16,8 +17,8 @@ const MAX_MOVE: f64 = 0.35;
 /// Grey levels between dark and light below which there is no corner (twice the model's c); camera noise is 1 to 4.
 const MIN_CONTRAST: f64 = 12.0;
 
-/// Part of the half contrast that the model may leave unexplained: sharp corners of clean and of compressed images leave 0.03 to 0.15,
-/// the border of a board 0.5 and more.
+/// Part of the half contrast that the model may leave unexplained: sharp corners of clean and of compressed images
+/// leave 0.03 to 0.15, the border of a board 0.5 and more.
 const MISFIT: f64 = 0.3;
 /// Camera noise that is allowed for besides, grey levels.
 const NOISE: f64 = 3.0;
@@ -32,8 +33,8 @@ pub(super) struct Saddle {
     pub(super) light: bool,
 }
 
-/// Measures the corner near `at`. `along` and `across` are the steps to the next corners of the grid, pixels; `reach` is how far
-/// the plain squares reach, in steps.
+/// Measures the corner near `at`. `along` and `across` are the steps to the next corners of the grid, pixels; `reach`
+/// is how far the plain squares reach, in steps.
 pub(super) fn measure(
     image: &GreyImage,
     at: Pixel,
@@ -75,7 +76,8 @@ pub(super) fn measure(
     let freedom = (window.pixels.len() as f64 - 7.0).max(1.0);
     // Rounding to whole grey levels leaves 1/12 however clean the image.
     let variance = (last.cost / freedom).max(1.0 / 12.0);
-    // Where a board ends, three squares around a point are light: the model leaves half of such a corner's contrast unexplained.
+    // Where a board ends, three squares around a point are light: the model leaves half of such a corner's contrast
+    // unexplained.
     if !(variance < (MISFIT * p[5]).powi(2) + NOISE.powi(2)) {
         return None;
     }
@@ -142,7 +144,8 @@ impl Window {
         if !(even.is_finite() && odd.is_finite()) {
             return None;
         }
-        // The normal of the edge along `across` points along `along`, so that the product is positive where both steps are.
+        // The normal of the edge along `across` points along `along`, so that the product is positive where both steps
+        // are.
         let n1 = angle(across) + std::f64::consts::PI;
         let n2 = angle(along);
         Some(P::from([at.x, at.y, n1, n2, 0.5 * (even + odd), 0.5 * (even - odd), 1.2]))

@@ -133,8 +133,8 @@ impl Target {
         matches!(self.kind, Kind::Charuco { .. })
     }
 
-    /// The relabellings under which the target looks the same and keeps its handedness: the point that each index becomes.
-    /// The first is the identity. Colours are not looked at here.
+    /// The relabellings under which the target looks the same and keeps its handedness: the point that each index
+    /// becomes. The first is the identity. Colours are not looked at here.
     pub fn turns(&self) -> Vec<Vec<usize>> {
         let (n, m) = (self.cols, self.rows);
         let turn = |f: &dyn Fn(usize, usize) -> (usize, usize)| -> Vec<usize> {

@@ -79,7 +79,7 @@ pub(super) fn side_by_side(panels: &[Canvas], gap: u32, above: u32, below: u32) 
     Some(canvas)
 }
 
-/// Text in parts of different colours.
+/// A line of text in several colours.
 fn heading(canvas: &mut Canvas, x: f64, y: f64, s: u32, parts: &[(&str, Rgba)]) {
     let mut at = x;
     for (text, colour) in parts {

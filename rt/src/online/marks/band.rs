@@ -1,8 +1,9 @@
-//! The pixels that tell where a mark is: those about its predicted rim, and flat ones on either side that tell the levels.
+//! The pixels that tell where a mark is: those about its predicted rim, and flat ones on either side that tell the
+//! levels.
 //!
-//! They are gathered row by row into contiguous arrays, sector by sector of the rim, so that the fit runs over them four at a
-//! time, and so that a sector in which something hides the rim can be left out. The number of pixels is bounded whatever the
-//! size of the mark: a longer rim is read in every second or third row.
+//! They are gathered row by row into contiguous arrays, sector by sector of the rim, so that the fit runs over them
+//! four at a time, and so that a sector in which something hides the rim can be left out. The number of pixels is
+//! bounded whatever the size of the mark: a longer rim is read in every second or third row.
 
 use super::Outline;
 use crate::image::ImageView;
@@ -141,7 +142,8 @@ impl Band {
         }
     }
 
-    /// Reads the pixels about `outline` shifted by `shift`: the rim as far as `reach` px on either side, and flat ones beyond.
+    /// Reads the pixels about `outline` shifted by `shift`: the rim as far as `reach` px on either side, and flat ones
+    /// beyond.
     pub(crate) fn gather(&mut self, image: &ImageView<'_>, outline: &Outline, shift: Vector2<f64>, reach: f64) {
         let limits = limits(outline, reach);
         let centre = outline.centre + shift;
@@ -197,7 +199,8 @@ impl Band {
         }
     }
 
-    /// Takes one side of a row, its flat pixels only where `flat`. `at` is (column of the centre from `base`, row from the centre).
+    /// Takes one side of a row, its flat pixels only where `flat`. `at` is (column of the centre from `base`, row from
+    /// the centre).
     #[inline]
     fn take(&mut self, pixels: &[u8], base: i64, b: &Row, (side, flat): (usize, bool), at: [f32; 2]) {
         let [a0, a1, a2, a3, middle, b3, b2, b1, b0] = *b;
@@ -224,8 +227,8 @@ impl Band {
 
     /// Distance, normal and curvature of the predicted rim at each rim pixel.
     ///
-    /// With `u` the pixel in disc coordinates and `J` the map's derivative, the gradient of |u| is `Jᵀu/|u|`; along it the rim,
-    /// where |u| is 1, is met to second order. For a circle this is exact.
+    /// With `u` the pixel in disc coordinates and `J` the map's derivative, the gradient of |u| is `Jᵀu/|u|`; along it
+    /// the rim, where |u| is 1, is met to second order. For a circle this is exact.
     fn place(&mut self, outline: &Outline) {
         let l = outline.disc_from_pixel.linear.map(|v| f32x4::splat(v as f32));
         let q = outline.disc_from_pixel.square.map(|v| f32x4::splat(v as f32));

@@ -1,8 +1,8 @@
 //! Where in its window a mark is, to within a fraction of its radius: a vote of ring samples.
 //!
-//! For a shift of the predicted outline, each direction compares the grey just inside with the grey just outside. A disc of
-//! another size scores little (one of its two rings is wrong everywhere), a half hidden one still peaks at the right place, and
-//! the work is a fixed number of samples whatever the image holds (fault M07).
+//! For a shift of the predicted outline, each direction compares the grey just inside with the grey just outside. A
+//! disc of another size scores little (one of its two rings is wrong everywhere), a half hidden one still peaks at the
+//! right place, and the work is a fixed number of samples whatever the image holds (fault M07).
 
 use super::Outline;
 use super::outline::OutlinePoint;

@@ -1,9 +1,10 @@
-//! How much of a pixel a disc covers, by the pixel's distance from the rim: the pixel's own area, the lens's blur, and motion.
+//! How much of a pixel a disc covers, by the pixel's distance from the rim: the pixel's own area, the lens's blur, and
+//! motion.
 //!
-//! Across a straight edge the unit pixel looks like a trapezoid (exact for every direction of the edge) of variance 1/12. Blur is
-//! a mixture of sharp and Gaussian below [`KNOT`] px² of variance, and a Gaussian above: there pixel and blur together are one
-//! Gaussian with the trapezoid's fourth cumulant put right. Motion during the exposure is a box along it. docs/TRACKER.md
-//! derives all three.
+//! Across a straight edge the unit pixel looks like a trapezoid (exact for every direction of the edge) of variance
+//! 1/12. Blur is a mixture of sharp and Gaussian below [`KNOT`] px² of variance, and a Gaussian above: there pixel and
+//! blur together are one Gaussian with the trapezoid's fourth cumulant put right. Motion during the exposure is a box
+//! along it. docs/TRACKER.md derives all three.
 
 use wide::f32x4;
 
@@ -11,8 +12,8 @@ use wide::f32x4;
 pub(crate) const PIXEL_VARIANCE: f32 = 1.0 / 12.0;
 /// Blur variance from which on the Gaussian alone is good to 0.3 % of the step, px².
 pub(crate) const KNOT: f32 = 0.09;
-/// Blur variance below which an image is taken for sharp, px²: it changes no pixel by more than 0.2 % of the step, and a single
-/// mark tells it from none only at noise below that.
+/// Blur variance below which an image is taken for sharp, px²: it changes no pixel by more than 0.2 % of the step, and
+/// a single mark tells it from none only at noise below that.
 const LEAST_BLUR: f32 = 0.004;
 /// Largest blur variance that is modelled, px²: 2.5 px.
 pub(crate) const MAX_VARIANCE: f32 = 6.25;
@@ -109,7 +110,8 @@ impl Profile {
         }
     }
 
-    /// Coverage at distance `d` (positive inside) from a rim with outward unit normal (`nx`, `ny`) and the given curvature.
+    /// Coverage at distance `d` (positive inside) from a rim with outward unit normal (`nx`, `ny`) and the given
+    /// curvature.
     #[inline(always)]
     pub(crate) fn cover(&self, d: f32x4, nx: f32x4, ny: f32x4, curvature: f32x4) -> Cover {
         let (ax, ay) = (nx.abs(), ny.abs());
@@ -202,8 +204,8 @@ mod tests {
     use super::*;
     use crate::math;
 
-    /// Coverage of the unit pixel at (d, 0) in the frame of a rim of radius `r` about (-r, 0), turned by `angle` against the
-    /// pixel's axes, smeared by a Gaussian and a box: by plain sums.
+    /// Coverage of the unit pixel at (d, 0) in the frame of a rim of radius `r` about (-r, 0), turned by `angle`
+    /// against the pixel's axes, smeared by a Gaussian and a box: by plain sums.
     fn summed(d: f64, angle: f64, r: f64, sigma: f64, motion: [f64; 2]) -> f64 {
         let (s, c) = math::sin_cos(angle);
         let side: i32 = if sigma > 0.0 { 24 } else { 400 };

@@ -19,10 +19,11 @@ pub(crate) struct Edge {
     pub(crate) contrast: f64,
 }
 
-/// Finds the strongest edge of the wanted polarity between `-inward` and `outward` pixels of the (shifted) outline point.
+/// Finds the strongest edge of the wanted polarity between `-inward` and `outward` pixels of the (shifted) outline
+/// point.
 ///
-/// The position is where the grey is half way between its levels on both sides. Blur and the pixels' own area smear the step
-/// evenly to both sides, so that this point stays on the true edge.
+/// The position is where the grey is half way between its levels on both sides. Blur and the pixels' own area smear the
+/// step evenly to both sides, so that this point stays on the true edge.
 pub(crate) fn find(
     image: &ImageView<'_>,
     point: &OutlinePoint,

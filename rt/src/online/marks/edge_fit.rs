@@ -6,8 +6,8 @@ use super::outline::{MAX_OUTLINE, OutlinePoint};
 use crate::math;
 use nalgebra::{Matrix5, Vector2, Vector5};
 
-/// How far the shape may be from the prediction before edges tell (one sigma of a relative stretch): a small arc then still
-/// gives a centre, with the prediction's shape.
+/// How far the shape may be from the prediction before edges tell (one sigma of a relative stretch): a small arc then
+/// still gives a centre, with the prediction's shape.
 const SHAPE_SIGMA: f64 = 0.05;
 /// Nothing is believed to be better than this, pixels: pixels have structure that noise models do not know.
 const EDGE_FLOOR: f64 = 0.015;

@@ -1,8 +1,8 @@
 //! A mark's shift from its predicted outline, by the grey values about its rim.
 //!
-//! [`track`] is for a mark whose shape and blur are known: two looks at the pixels, six unknowns. [`track_carefully`] leaves out
-//! sectors of the rim that do not fit; `settle` fits blur and shape as well. All end with a judgement: whether what they leave is
-//! what the flat pixels have as noise.
+//! [`track`] is for a mark whose shape and blur are known: two looks at the pixels, six unknowns. [`track_carefully`]
+//! leaves out sectors of the rim that do not fit; `settle` fits blur and shape as well. All end with a judgement:
+//! whether what they leave is what the flat pixels have as noise.
 
 use super::Outline;
 use super::band::Band;
@@ -19,10 +19,11 @@ pub(crate) const ROOM: f64 = 0.3;
 const TRACK_RANGE: f64 = 0.6;
 /// A step shorter than this leaves less than 1 % of itself, px (docs/TRACKER.md: one of 0.3 px leaves 0.016 px).
 pub(crate) const SETTLED: f64 = 0.05;
-/// Misfit of the rim, in pixels of its position, below which a model explains a mark: about what rounding to whole grey values
-/// leaves at a contrast of a hundred.
+/// Misfit of the rim, in pixels of its position, below which a model explains a mark: about what rounding to whole grey
+/// values leaves at a contrast of a hundred.
 pub(crate) const EXPLAINED_PX: f64 = 0.008;
-/// Deviations by which the rim's noise may exceed that of the flat pixels by chance: one mark in eighty is fitted anew in vain.
+/// Deviations by which the rim's noise may exceed that of the flat pixels by chance: one mark in eighty is fitted anew
+/// in vain.
 const CHANCE: f64 = 2.5;
 /// How steep the light is before the data tell, relative to itself, 1/px (one sigma): 5 % over a disc of 10 px.
 pub(crate) const SLOPE_SIGMA: f64 = 0.005;
@@ -189,8 +190,8 @@ pub(crate) fn judged<const N: usize>(
     stretch: [f64; 3],
 ) -> Estimate {
     let step = f64::from(m.step());
-    // The noise as the shift sees it: each pixel's residual by its squared derivative, over as many pixels as weigh that much;
-    // two more are taken off because it is the inverse that has to be unbiased.
+    // The noise as the shift sees it: each pixel's residual by its squared derivative, over as many pixels as weigh
+    // that much; two more are taken off because it is the inverse that has to be unbiased.
     let pixels = math::sq(e.weights) / e.weights2.max(1e-12);
     let freedom = (pixels - (PLAIN - 2) as f64).max(2.0);
     let rim = e.weighted_squares / e.weights.max(1e-12) * (pixels / freedom);

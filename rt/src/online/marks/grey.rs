@@ -1,9 +1,10 @@
-//! The fit of the pixel-integrated disc to grey values: Gauss-Newton on the shift, the levels, the light's slope, and, where
-//! asked for, the blur and the shape.
+//! The fit of the pixel-integrated disc to grey values: Gauss-Newton on the shift, the levels, the light's slope, and,
+//! where asked for, the blur and the shape.
 //!
-//! A pixel at `x` from the mark's centre is `(1 + slope·x) (outside + (inside - outside) c)`, with `c` the share of it that the
-//! disc covers. The derivative of `c` by the rim's distance is the rim's length inside the pixel, so that the information about
-//! the shift sits in the pixels that the rim crosses; the flat ones tell the levels. docs/TRACKER.md derives the model.
+//! A pixel at `x` from the mark's centre is `(1 + slope·x) (outside + (inside - outside) c)`, with `c` the share of it
+//! that the disc covers. The derivative of `c` by the rim's distance is the rim's length inside the pixel, so that the
+//! information about the shift sits in the pixels that the rim crosses; the flat ones tell the levels. docs/TRACKER.md
+//! derives the model.
 
 use super::band::{Band, Pixels, four, put};
 use super::coverage::{Cover, Profile, Smear, trapezoid};

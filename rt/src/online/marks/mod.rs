@@ -1,8 +1,9 @@
-//! Marks in one image: predicted outline, fit of the pixel-integrated disc to the grey values about its rim; where that does not
-//! explain the image, a coarse vote in a window and sub-pixel edges, and the fit again. docs/TRACKER.md derives it.
+//! Marks in one image: predicted outline, fit of the pixel-integrated disc to the grey values about its rim; where that
+//! does not explain the image, a coarse vote in a window and sub-pixel edges, and the fit again. docs/TRACKER.md
+//! derives it.
 //!
-//! The work on a mark is bounded by constants (pixels in the band, looks at them, samples in the vote, points on the outline,
-//! samples along a normal), so that no image, however full of blobs, makes a cycle late (fault M07).
+//! The work on a mark is bounded by constants (pixels in the band, looks at them, samples in the vote, points on the
+//! outline, samples along a normal), so that no image, however full of blobs, makes a cycle late (fault M07).
 
 mod band;
 mod coarse;
@@ -35,7 +36,8 @@ pub struct MarkSettings {
     pub search_px: f64,
     /// Smallest grey difference between disc and surroundings. Default 12.
     pub min_contrast: f64,
-    /// Smallest share of the rim that must be found in place, 0 to 1. Default 0.5; below about 0.4 the centre is a guess.
+    /// Smallest share of the rim that must be found in place, 0 to 1. Default 0.5; below about 0.4 the centre is a
+    /// guess.
     pub min_share: f64,
     /// Smallest cosine between the disc's normal and the direction to the camera. Default 0.2 (78 degrees).
     pub min_facing: f64,
@@ -79,8 +81,8 @@ const MAX_MAJOR: f64 = 48.0;
 const CENTRE_FLOOR: f64 = 0.0003 * 0.0003;
 /// Blur that is assumed until a mark has shown another, px² (0.6 px).
 pub const USUAL_BLUR: f64 = 0.36;
-/// Misfit of the rim, in pixels of its position, that is believed where blur and shape were fitted: a real mark is not quite
-/// round, and its edge not quite a step.
+/// Misfit of the rim, in pixels of its position, that is believed where blur and shape were fitted: a real mark is not
+/// quite round, and its edge not quite a step.
 const CLOSE_PX: f64 = 0.06;
 /// The same where the edges along the normals were found first, at the rim and for each pixel of half width.
 const FOUND_PX: (f64, f64) = (0.2, 0.02);
@@ -129,8 +131,8 @@ impl MarkMeter {
 
     /// Measures one mark in one image, from its predicted outline.
     ///
-    /// The result's pixel is the image of the disc's *centre* (distorted pixels): the fitted shift is applied to the predicted
-    /// image of the centre.
+    /// The result's pixel is the image of the disc's *centre* (distorted pixels): the fitted shift is applied to the
+    /// predicted image of the centre.
     ///
     /// # Errors
     /// Says why there is no measurement; that is an ordinary event, never a fault by itself.

@@ -1,9 +1,10 @@
 //! The predicted image of one mark: the map between its disc and the pixels about it.
 //!
-//! The image of a disc's rim is no ellipse under distortion, and the image of the disc's centre is neither its centroid nor its
-//! ellipse's centre (literature: discocal 2024). The map from disc to pixels is therefore kept to second order, fitted to eight
-//! exactly projected rim points: what it leaves out is of the order of the square of (radius / distance), 1e-5 of a radius at
-//! work distance. How the predicted rim has to be *shifted* to fit the image then gives the image of the centre without bias.
+//! The image of a disc's rim is no ellipse under distortion, and the image of the disc's centre is neither its centroid
+//! nor its ellipse's centre (literature: discocal 2024). The map from disc to pixels is therefore kept to second order,
+//! fitted to eight exactly projected rim points: what it leaves out is of the order of the square of (radius /
+//! distance), 1e-5 of a radius at work distance. How the predicted rim has to be *shifted* to fit the image then gives
+//! the image of the centre without bias.
 
 use crate::geom::{Camera, Pixel, Pose, Vec3};
 use crate::gripper::Mark;
@@ -25,7 +26,8 @@ pub struct OutlinePoint {
     pub pixel: Pixel,
     /// Unit normal pointing out of the disc.
     pub normal: Vector2<f64>,
-    /// Distance from the disc's centre to the tangent here, pixels: how far one may walk inwards before reaching the far half.
+    /// Distance from the disc's centre to the tangent here, pixels: how far one may walk inwards before reaching the
+    /// far half.
     pub support: f64,
 }
 
@@ -153,7 +155,8 @@ fn extent(b: &Matrix2<f64>) -> Option<(f64, f64)> {
 
 /// A disc in a camera's frame: its centre, normal, and the cosine at which it faces the camera.
 ///
-/// `None` when it faces away (below `min_facing`), is behind the camera or too near to it, or when a figure is not finite.
+/// `None` when it faces away (below `min_facing`), is behind the camera or too near to it, or when a figure is not
+/// finite.
 fn disc(camera_from_gripper: &Pose, mark: &Mark, min_facing: f64) -> Option<(Vec3, Vec3, f64)> {
     let centre = (camera_from_gripper * Point3::from(mark.position)).coords;
     let normal = camera_from_gripper.rotation * mark.normal;
@@ -178,8 +181,8 @@ pub fn footprint(camera: &Camera, camera_from_gripper: &Pose, mark: &Mark, min_f
 
 /// Predicts a mark's outline in a camera.
 ///
-/// `None` when the disc faces away (`facing` below `min_facing`), is behind the camera or too near to it, or when a figure is
-/// not finite. The outline may lie outside the image: the caller decides.
+/// `None` when the disc faces away (`facing` below `min_facing`), is behind the camera or too near to it, or when a
+/// figure is not finite. The outline may lie outside the image: the caller decides.
 pub fn predict(camera: &Camera, camera_from_gripper: &Pose, mark: &Mark, min_facing: f64) -> Option<Outline> {
     let (centre3, normal, facing) = disc(camera_from_gripper, mark, min_facing)?;
     let centre = camera.project(&centre3)?;

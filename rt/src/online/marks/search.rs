@@ -10,8 +10,8 @@ use crate::math;
 
 /// Looks for a mark within `search_px` of its predicted outline. `sign` is +1 for a dark mark, -1 for a light one.
 ///
-/// Also returns the edges' contrast. The work is bounded by constants: samples in the vote, points on the outline, samples along
-/// a normal, rounds of the fit.
+/// Also returns the edges' contrast. The work is bounded by constants: samples in the vote, points on the outline,
+/// samples along a normal, rounds of the fit.
 pub(crate) fn search(
     image: &ImageView<'_>,
     outline: &Outline,
@@ -55,7 +55,8 @@ pub(crate) fn search(
         if fit.stretch.iter().any(|s| math::fabs(*s) > settings.max_stretch) {
             return Err(MarkMiss::Shape);
         }
-        // Edges are read linearly about the outline: a step of less than a twentieth of a pixel leaves nothing to be gained.
+        // Edges are read linearly about the outline: a step of less than a twentieth of a pixel leaves nothing to be
+        // gained.
         if pass > 0 && (fit.shift - before).norm_squared() < 0.05 * 0.05 {
             break;
         }

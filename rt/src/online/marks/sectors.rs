@@ -6,7 +6,8 @@ use super::edge_fit::middle;
 use super::grey::Model;
 use crate::math;
 
-/// A sector whose mean square is this many times the middle one's is hidden by something: by chance, ten pixels are once in 10^6.
+/// A sector whose mean square is this many times the middle one's is hidden by something: by chance, ten pixels are
+/// once in 10^6.
 const SECTOR_FACTOR: f64 = 5.0;
 /// A sector whose flat pixels are this share of the step off the others' level is hidden.
 const FAR_SHARE: f32 = 0.25;
@@ -85,7 +86,8 @@ pub(crate) fn begin_carefully(band: &mut Band, smear: Smear) -> Option<(Model, H
     Some((m, hidden))
 }
 
-/// The third of the sectors' mean squares, grey values squared: the noise, whatever hides less than two thirds of the rim.
+/// The third of the sectors' mean squares, grey values squared: the noise, whatever hides less than two thirds of the
+/// rim.
 pub(crate) fn flat_noise(band: &Band) -> f64 {
     let mut all: heapless::Vec<f64, SECTORS> = heapless::Vec::new();
     for k in 0..SECTORS {
@@ -107,8 +109,8 @@ fn low(v: &mut [f64]) -> f64 {
     *v.select_nth_unstable_by(at, f64::total_cmp).1
 }
 
-/// Sectors that do not fit, `hidden` being those that were left out: all that fit are taken in again, and the worst of those
-/// that do not is left out. `floor_px` is what the rim may be off by anyway.
+/// Sectors that do not fit, `hidden` being those that were left out: all that fit are taken in again, and the worst of
+/// those that do not is left out. `floor_px` is what the rim may be off by anyway.
 pub(crate) fn review(band: &Band, m: &Model, noise: f64, hidden: Hidden, floor_px: f64) -> Hidden {
     let floor = math::sq(floor_px * f64::from(m.step()));
     let mut seen: heapless::Vec<f64, SECTORS> = heapless::Vec::new();

@@ -32,7 +32,8 @@ fn solve<const N: usize>(
     p.iter().chain(c.iter()).all(|v| v.is_finite()).then_some((p, c))
 }
 
-/// The shift with blur and shape fitted too, about an outline of roughly the right place, without sectors that do not fit.
+/// The shift with blur and shape fitted too, about an outline of roughly the right place, without sectors that do not
+/// fit.
 ///
 /// Work is bounded: [`LOOKS`] looks, and two more for each of [`ROUNDS`] reviews.
 pub(crate) fn settle(

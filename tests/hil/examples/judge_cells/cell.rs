@@ -16,10 +16,11 @@ use std::f64::consts::TAU;
 
 /// Largest error of a click along each axis, pixels; that of the scenario's own clicks.
 const MAX_CLICK_ERROR_PX: f64 = 1.2;
-/// Distance to either side of an outline at which a click needs the bar and its background, pixels; above the click error.
+/// Distance to either side of an outline at which a click needs the bar and its background, pixels; above the click
+/// error.
 const CLEARANCE_PX: f64 = 2.0;
-/// A surface occludes a point if it is nearer to the camera by this much, metres; above the distance at which a grazing ray
-/// first hits the bar.
+/// A surface occludes a point if it is nearer to the camera by this much, metres; above the distance at which a grazing
+/// ray first hits the bar.
 const MIN_OCCLUSION_M: f64 = 1e-3;
 /// JPEG quality of the round trip.
 const JPEG_QUALITY: u8 = 85;
@@ -63,7 +64,8 @@ pub enum Noise {
     Jpeg,
 }
 
-/// Error of the given rig: both focal lengths, percent, and the relative rotation, degrees; the seed determines sign and axis.
+/// Error of the given rig: both focal lengths, percent, and the relative rotation, degrees; the seed determines sign
+/// and axis.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RigError {
     /// Of the focal lengths, percent.
@@ -259,7 +261,8 @@ fn seen_pixels(s: &Scenario, shape: &Shape) -> [Vec<Pixel>; 2] {
     })
 }
 
-/// A click on a visible part of the bar's outer (0) or inner (1) outline, with the bar on one side and background on the other.
+/// A click on a visible part of the bar's outer (0) or inner (1) outline, with the bar on one side and background on
+/// the other.
 fn silhouette_click(s: &Scenario, core: &Shape, view: View, side: usize, rng: &mut impl Rng) -> Option<Pixel> {
     let camera_centre = s.true_rig.centre(view);
     for _ in 0..400 {
@@ -308,7 +311,8 @@ fn through_jpeg(grey: &[u8], w: u32, h: u32) -> Result<Vec<u8>, String> {
     Ok(DynamicImage::from_decoder(decoder).map_err(|e| e.to_string())?.into_luma8().into_raw())
 }
 
-/// A painted ellipse on a darker board that fills the view: area coverage from 4 x 4 samples per pixel, then the lens's blur.
+/// A painted ellipse on a darker board that fills the view: area coverage from 4 x 4 samples per pixel, then the lens's
+/// blur.
 fn ellipse_image(s: &Scenario, view: View, shape: &Shape, noise: Noise, rng: &mut ChaCha8Rng) -> Vec<u8> {
     const FINE: usize = 4;
     let camera = s.true_rig.camera(view);

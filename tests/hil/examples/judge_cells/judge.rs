@@ -213,8 +213,8 @@ fn refusal(e: &PlanError) -> String {
     debug.split([' ', '{']).next().unwrap_or_default().replace('(', "/").replace(')', "")
 }
 
-/// Compares a plan with the rims that the click could select: a bar with the bar, a plane edge clicked on paint with the paint,
-/// a plane edge clicked on a silhouette with the nearer one of both.
+/// Compares a plan with the rims that the click could select: a bar with the bar, a plane edge clicked on paint with
+/// the paint, a plane edge clicked on a silhouette with the nearer one of both.
 fn measure(
     cell: &Cell,
     p: &Plan,

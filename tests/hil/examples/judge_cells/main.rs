@@ -6,10 +6,10 @@
 //!     --clicks paint,outer,inner --rims auto,edge,round-bar,round-bar+d --first 1 --count 20
 //! ```
 //!
-//! An answer is wrong if ground truth is outside its own 99.9 % region, or if its error exceeds the error floor of the rig by
-//! more than 1 mm, 0.5 degrees or (bar radius) 1 mm. The error floor is the error of the maximum-likelihood rim on exact edges
-//! with the same rig. "Loop" is the error of a gripper whose servo loop, with the true cameras, has converged on the plan's
-//! marks.
+//! An answer is wrong if ground truth is outside its own 99.9 % region, or if its error exceeds the error floor of the
+//! rig by more than 1 mm, 0.5 degrees or (bar radius) 1 mm. The error floor is the error of the maximum-likelihood rim
+//! on exact edges with the same rig. "Loop" is the error of a gripper whose servo loop, with the true cameras, has
+//! converged on the plan's marks.
 
 #![allow(unreachable_pub)] // modules shared by path with a test
 

@@ -1,5 +1,5 @@
-//! Reference results: the maximum-likelihood rim on exact edge points with a given rig, and the end pose of a converged servo
-//! loop.
+//! Reference results: the maximum-likelihood rim on exact edge points with a given rig, and the end pose of a converged
+//! servo loop.
 //!
 //! Independent of the off-line stage that is judged: numeric derivatives, no gates, only the camera model is shared.
 
@@ -51,8 +51,8 @@ impl Shape {
 
     /// Points of the outer and inner outline of a bar at a core angle, seen from `eye`; `None` for a plane edge.
     ///
-    /// On the tube around core direction `e` the surface normal `m = e cos v + n sin v` is perpendicular to the viewing ray:
-    /// `m . d = -r`, with `d` from the camera centre to the core point.
+    /// On the tube around core direction `e` the surface normal `m = e cos v + n sin v` is perpendicular to the viewing
+    /// ray: `m . d = -r`, with `d` from the camera centre to the core point.
     pub fn outlines(&self, eye: &Vec3, angle: f64) -> Option<[Vec3; 2]> {
         let bar = self.bar?;
         let core = self.point(angle);
@@ -245,8 +245,8 @@ fn with_shape(mut shape: Shape, s: &Matrix2<f64>) -> Shape {
     shape
 }
 
-/// Gripper pose of a converged servo loop with the true cameras: the least-squares fit of the projected marks to the goal's
-/// predicted pixels in both images.
+/// Gripper pose of a converged servo loop with the true cameras: the least-squares fit of the projected marks to the
+/// goal's predicted pixels in both images.
 pub fn loop_ends(goal: &Goal, gripper: &Gripper, true_rig: &Rig) -> Option<Pose> {
     let predicted: Vec<(View, Vec3, Pixel)> = View::BOTH
         .into_iter()

@@ -16,7 +16,8 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// A mock Universal Robots controller: dashboard 29999, primary 30001, secondary 30002, real-time 30003, RTDE 30004, interpreter 30020.
+/// A mock Universal Robots controller: dashboard 29999, primary 30001, secondary 30002, real-time 30003, RTDE 30004,
+/// interpreter 30020.
 ///
 /// It runs uploaded URScript, moves a simulated arm and checks every set-point. When it is ready it prints one line of
 /// JSON.

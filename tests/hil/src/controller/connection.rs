@@ -105,7 +105,8 @@ impl Connection {
         }
     }
 
-    /// Sends a data package, or skips it while earlier bytes are still queued: clients need the newest package, not all.
+    /// Sends a data package, or skips it while earlier bytes are still queued: clients need the newest package, not
+    /// all.
     pub(super) fn send_newest(&mut self, bytes: &[u8], wire: &WireFaults, now_ns: u64, random: f64) {
         if self.out.is_empty() {
             self.send(bytes, wire, now_ns, random);

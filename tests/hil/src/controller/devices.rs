@@ -1,4 +1,5 @@
-//! Devices around the robot that only scripts use: encoders, Modbus signals, and the ports of the robot's Modbus server.
+//! Devices around the robot that only scripts use: encoders, Modbus signals, and the ports of the robot's Modbus
+//! server.
 
 use crate::urscript::{HostError, Value};
 use std::collections::BTreeMap;

@@ -1,5 +1,5 @@
-//! Fuzzing of every parser of the controller. `GRASPD_FUZZ_CASES=2500000 cargo test --release -p graspd-hil --lib fuzz` runs
-//! 12.5 million cases; the default takes a few seconds.
+//! Fuzzing of every parser of the controller. `GRASPD_FUZZ_CASES=2500000 cargo test --release -p graspd-hil --lib fuzz`
+//! runs 12.5 million cases; the default takes a few seconds.
 
 use super::command::Command;
 use super::connection::lines;

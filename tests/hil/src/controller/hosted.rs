@@ -41,8 +41,8 @@ pub enum HostedError {
 static COUNT: AtomicU32 = AtomicU32::new(0);
 
 impl Hosted {
-    /// Starts a mock on a loopback address that no other test uses. `limits` are the rate and acceleration that its client
-    /// promises (rad/s, rad/s^2).
+    /// Starts a mock on a loopback address that no other test uses. `limits` are the rate and acceleration that its
+    /// client promises (rad/s, rad/s^2).
     ///
     /// # Errors
     /// When the ports are taken or the record cannot be written.

@@ -1,8 +1,8 @@
 //! The judge, a test oracle: checks the set-points of clients and the motion of the arm against limits.
 //!
 //! It knows the register layout of the project's control script (set-points in float registers 24 to 29, mode word in
-//! integer register 24, heartbeat counter in 25) and shares no code with the client. It receives every input package and
-//! every control step, live from the mock or later from the wire record.
+//! integer register 24, heartbeat counter in 25) and shares no code with the client. It receives every input package
+//! and every control step, live from the mock or later from the wire record.
 
 use crate::plant::Joints;
 use graspd_rt::rtde::{Field, Value};
@@ -83,8 +83,8 @@ pub struct Episode {
 }
 
 impl Episode {
-    /// Time from the last heartbeat to rest, ns; `None` while the arm moves. After a client was killed this is the reaction
-    /// time of watchdog and ramp.
+    /// Time from the last heartbeat to rest, ns; `None` while the arm moves. After a client was killed this is the
+    /// reaction time of watchdog and ramp.
     pub fn stop_ns(&self) -> Option<u64> {
         (self.rest_ns > 0).then(|| self.rest_ns.saturating_sub(self.last_heartbeat_ns))
     }

@@ -1,7 +1,8 @@
 //! A simulated Universal Robots controller.
 //!
-//! Layers, in reading order: [`Robot`] is the robot in memory, one control step per call; [`World`] adds the test oracle
-//! ([`Judge`]), the wire record and the faults; [`Server`] puts it behind sockets. [`main_with_args`] is the program.
+//! Layers, in reading order: [`Robot`] is the robot in memory, one control step per call; [`World`] adds the test
+//! oracle ([`Judge`]), the wire record and the faults; [`Server`] puts it behind sockets. [`main_with_args`] is the
+//! program.
 //!
 //! The controller's side of the wire formats shares no code with the daemon's client, so that an error in one of them
 //! shows as a disagreement. Only the table of RTDE variables is shared.

@@ -124,7 +124,8 @@ pub(super) fn message_package(message: &Message) -> Vec<u8> {
     w.0
 }
 
-/// The robot state package. `full` adds configuration, kinematics and calibration, which do not change from step to step.
+/// The robot state package. `full` adds configuration, kinematics and calibration, which do not change from step to
+/// step.
 pub(super) fn robot_state(robot: &Robot, full: bool) -> Vec<u8> {
     let mut w = Writer(Vec::with_capacity(2048));
     w.part(ROBOT_STATE, |w| {

@@ -13,8 +13,8 @@ impl Robot {
         matches!(self.runtime, RuntimeState::Playing | RuntimeState::Resuming)
     }
 
-    /// Takes a script as ports 30001 to 30003 do: `def` replaces the main program, `sec` runs as a secondary program, a bare
-    /// line is a program of one line.
+    /// Takes a script as ports 30001 to 30003 do: `def` replaces the main program, `sec` runs as a secondary program, a
+    /// bare line is a program of one line.
     pub fn upload(&mut self, text: &str) -> Upload {
         self.upload_at(text, 1)
     }

@@ -1,12 +1,12 @@
 //! The wire record: every input package with its receive time and every control step in one binary file.
 //!
-//! Little-endian. The file begins with the eight bytes `URWIRE01`. Records follow, each a kind byte and a body whose length
-//! follows from the kind:
+//! Little-endian. The file begins with the eight bytes `URWIRE01`. Records follow, each a kind byte and a body whose
+//! length follows from the kind:
 //!
-//! - `I` input package: u64 receive time ns, u64 client, u8 count, then for each field u16 number (RTDE input list), u8 length
-//!   and the value's bytes as on the wire.
-//! - `S` control step: u64 time ns, f64 controller time, six f64 each of target position, target speed, position, speed (rad,
-//!   rad/s), u8 robot mode, u8 safety mode, u8 runtime state.
+//! - `I` input package: u64 receive time ns, u64 client, u8 count, then for each field u16 number (RTDE input list), u8
+//!   length and the value's bytes as on the wire.
+//! - `S` control step: u64 time ns, f64 controller time, six f64 each of target position, target speed, position, speed
+//!   (rad, rad/s), u8 robot mode, u8 safety mode, u8 runtime state.
 //! - `N` note: u64 time ns, u16 length, UTF-8 text (faults, connections, uploads).
 
 use super::judge::{Judge, Limits, StepSample, Summary};

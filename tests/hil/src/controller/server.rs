@@ -76,7 +76,8 @@ const PORTS: [(u16, Port, bool); 9] = [
 ];
 
 impl Server {
-    /// Opens all ports at `address`, `offset` added to each, and the control port if one is given (0 picks a free port).
+    /// Opens all ports at `address`, `offset` added to each, and the control port if one is given (0 picks a free
+    /// port).
     pub fn bind(world: World, address: IpAddr, offset: u16, control: Option<u16>) -> Result<Self, ListenError> {
         let mut listeners = Vec::new();
         let standard = PORTS.iter().map(|(number, port, ro)| (number.saturating_add(offset), *port, *ro));

@@ -1,5 +1,5 @@
-//! The mock controller without sockets, on a virtual clock: the same plant, interpreter, RTDE session and judge, one control
-//! step per call. A second of robot time takes milliseconds, and equal calls give bit-identical results.
+//! The mock controller without sockets, on a virtual clock: the same plant, interpreter, RTDE session and judge, one
+//! control step per call. A second of robot time takes milliseconds, and equal calls give bit-identical results.
 
 use crate::controller::{ClientId, Command, InputPackage, Robot, RtdeSession, Setup, Summary, Upload, World};
 use graspd_rt::rtde::{Field, FrameError, Value};

@@ -9,8 +9,8 @@ const LINEAR_GAIN: f64 = 0.04;
 const ANGULAR_GAIN: f64 = 1.0;
 /// Gain scaling of a controller after start, as documented for `force_mode_set_gain_scaling`.
 const DEFAULT_GAIN_SCALING: f64 = 0.5;
-/// Time constant of the velocity, s. With a contact stiffness of 2000 N/m the force loop has a bandwidth of 40 rad/s, far below
-/// this and the drives' lag of 8 ms, so that contact is stable.
+/// Time constant of the velocity, s. With a contact stiffness of 2000 N/m the force loop has a bandwidth of 40 rad/s,
+/// far below this and the drives' lag of 8 ms, so that contact is stable.
 const LAG_S: f64 = 0.005;
 /// Largest linear acceleration, m/s^2.
 const MAX_LINEAR_ACCEL: f64 = 5.0;

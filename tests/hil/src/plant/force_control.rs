@@ -32,8 +32,8 @@ impl Generator {
         }
     }
 
-    /// Adds the compliant displacement after the motion was advanced. `on_path` is true while the motion follows a path, to
-    /// which the displacement is relative.
+    /// Adds the compliant displacement after the motion was advanced. `on_path` is true while the motion follows a
+    /// path, to which the displacement is relative.
     pub(super) fn add_compliance(&mut self, on_path: bool, dt: f64) {
         for i in 0..6 {
             self.q[i] += self.compliance.offset[i];

@@ -21,7 +21,8 @@ pub(super) enum Active {
     Brake(f64, Option<Motion>),
     /// A move.
     Path(Leg),
-    /// The end of a move and the beginning of the next one: their displacements from `corner`, the end of the first, add up.
+    /// The end of a move and the beginning of the next one: their displacements from `corner`, the end of the first,
+    /// add up.
     Blend {
         tail: Leg,
         lead: Leg,

@@ -3,8 +3,8 @@
 use super::{Joints, Kinematics};
 use nalgebra::{Isometry3, Vector3};
 
-/// Joint torques (Nm) that hold the links and a payload (kg, at the flange) against gravity, base upright. Each link is a
-/// point mass at its middle.
+/// Joint torques (Nm) that hold the links and a payload (kg, at the flange) against gravity, base upright. Each link is
+/// a point mass at its middle.
 pub fn gravity_torques(kinematics: &Kinematics, masses: &Joints, payload: f64, q: &Joints) -> Joints {
     let mut torque = [0.0; 6];
     // The middle of a link is the flange of a chain that ends after half of its a and d.

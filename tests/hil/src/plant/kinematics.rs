@@ -1,7 +1,7 @@
 //! Forward and inverse kinematics of the simulated arm, independent of the daemon's.
 //!
-//! The mock exists to test the daemon's kinematics, so this second implementation shares no code with them: a wrong sign in
-//! either shows as a disagreement.
+//! The mock exists to test the daemon's kinematics, so this second implementation shares no code with them: a wrong
+//! sign in either shows as a disagreement.
 
 use super::Joints;
 use nalgebra::{Isometry3, Matrix4, Matrix6, Rotation3, Translation3, UnitQuaternion, Vector3, Vector6};
@@ -62,7 +62,8 @@ const IK_ITERATIONS: usize = 60;
 const IK_SEEDS: usize = 24;
 
 impl Kinematics {
-    /// Reads a `[dh]` table with `a`, `d`, `alpha`, `theta` of six numbers each (m, rad; `theta` is the joint zero offset).
+    /// Reads a `[dh]` table with `a`, `d`, `alpha`, `theta` of six numbers each (m, rad; `theta` is the joint zero
+    /// offset).
     pub fn from_file(path: &Path) -> Result<Self, KinematicsFileError> {
         let text = std::fs::read_to_string(path).map_err(|e| KinematicsFileError::Read(path.to_owned(), e))?;
         let file: DhFile =
@@ -137,7 +138,8 @@ impl Kinematics {
             return Some(q);
         }
         (0..IK_SEEDS).find_map(|k| {
-            // Shoulder left and right, elbow up and down, wrist flipped: a fixed lattice, so that results are reproducible.
+            // Shoulder left and right, elbow up and down, wrist flipped: a fixed lattice, so that results are
+            // reproducible.
             let pick = |shift: usize, values: &[f64]| values[(k >> shift) % values.len()];
             let base = goal.translation.y.atan2(goal.translation.x);
             let seed = [

@@ -28,7 +28,8 @@ pub(super) struct Leg {
 }
 
 impl Leg {
-    /// Advances by `dt` of path time and returns the joint positions; `None` if the path has no inverse kinematics solution.
+    /// Advances by `dt` of path time and returns the joint positions; `None` if the path has no inverse kinematics
+    /// solution.
     pub(super) fn advance(&mut self, dt: f64, kinematics: &Kinematics, tool: &Isometry3<f64>) -> Option<Joints> {
         self.profile.advance(dt);
         let f = self.profile.fraction();

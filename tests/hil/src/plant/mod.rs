@@ -1,8 +1,8 @@
 //! The arm of the mock controller: kinematics, motion generator, joint dynamics.
 //!
-//! The controller part ([`Generator`]) turns motion commands into joint targets, one control step at a time. The mechanical
-//! part ([`Drives`]) follows the targets with lag, limited acceleration and quantised encoders. Nothing reads a clock or a
-//! socket: `dt` is an argument.
+//! The controller part ([`Generator`]) turns motion commands into joint targets, one control step at a time. The
+//! mechanical part ([`Drives`]) follows the targets with lag, limited acceleration and quantised encoders. Nothing
+//! reads a clock or a socket: `dt` is an argument.
 
 mod compliance;
 mod drives;

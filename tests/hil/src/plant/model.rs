@@ -54,8 +54,8 @@ const UR10_SPEED: Joints = degrees([120.0, 120.0, 180.0, 180.0, 180.0, 180.0]);
 const UR20_SPEED: Joints = degrees([120.0, 120.0, 150.0, 210.0, 210.0, 210.0]);
 const UR20_TORQUE: Joints = [738.0, 738.0, 433.0, 107.0, 107.0, 107.0];
 
-/// Sources: UR's ROS 2 description 2.4.5 (limits, masses) and UR's article "DH Parameters for calculations of kinematics and
-/// dynamics".
+/// Sources: UR's ROS 2 description 2.4.5 (limits, masses) and UR's article "DH Parameters for calculations of
+/// kinematics and dynamics".
 const MODELS: [Model; 9] = [
     Model {
         name: "ur3",

@@ -12,8 +12,8 @@ pub struct Profile {
 impl Profile {
     /// A move over `length` (at least 0) with acceleration `accel` and speed `speed`; their absolute values are used.
     ///
-    /// With a `duration` above zero the speed is chosen so that the move takes that long. If `accel` does not permit it,
-    /// the move takes the shortest possible time.
+    /// With a `duration` above zero the speed is chosen so that the move takes that long. If `accel` does not permit
+    /// it, the move takes the shortest possible time.
     pub fn new(length: f64, speed: f64, accel: f64, duration: f64) -> Self {
         let accel = accel.abs().max(1e-6);
         let mut speed = speed.abs().max(1e-6);

@@ -19,7 +19,8 @@ pub struct Circle {
 }
 
 impl Scenario {
-    /// All circles of the scene. The first is the rim that [`Scenario::clicks`] select (for a bare wheel its core circle).
+    /// All circles of the scene. The first is the rim that [`Scenario::clicks`] select (for a bare wheel its core
+    /// circle).
     pub fn circles(&self, shot: &Snapshot) -> Vec<Circle> {
         let (pose, w) = (self.left_from_object(), &self.stage.wheel);
         let (rb, z0) = (w.bar_radius_m, w.core_z());

@@ -207,8 +207,8 @@ fn draw_stage(
     towards: &Vec3,
 ) -> (Stage, Sensor) {
     let to_object = base_from_object.rotation.inverse();
-    // Diffuse light and a lamp near the cameras, never behind the valve. Hard light from the side shades a painted bar and
-    // shifts its apparent edges by more than 0.1 px towards the lamp; cells are not set up like that.
+    // Diffuse light and a lamp near the cameras, never behind the valve. Hard light from the side shades a painted bar
+    // and shifts its apparent edges by more than 0.1 px towards the lamp; cells are not set up like that.
     let mut light = to_object * (towards + unit(rng) * 0.5);
     light.z = light.z.max(0.35);
     let pipe_angle_rad = rng.random_range(0.0..PI);
@@ -247,8 +247,8 @@ fn draw_stage(
     (stage, sensor)
 }
 
-/// Start joints from which the arm can move in straight lines to pre-grasp and grasp, with the marks visible on the whole
-/// path and the rim unobstructed at the start.
+/// Start joints from which the arm can move in straight lines to pre-grasp and grasp, with the marks visible on the
+/// whole path and the rim unobstructed at the start.
 fn draw_start(s: &Scenario, body: &Body, rng: &mut ChaCha8Rng) -> Option<Joints> {
     let flange_from_gripper = s.gripper.gripper.flange_from_gripper;
     let open = s.gripper.opening[1];
@@ -284,8 +284,8 @@ fn draw_start(s: &Scenario, body: &Body, rng: &mut ChaCha8Rng) -> Option<Joints>
         for q in closed_form(&s.model.dh(), &first, 0.0) {
             let q = within_half_turn(q);
             let Some(joints) = straight_path(s.model, &s.true_dh, &flange_from_gripper, &poses, &q) else { continue };
-            // The plan may choose another rotation about the axis, because visibility hardly depends on it: the arm must be
-            // able to follow those paths as well.
+            // The plan may choose another rotation about the axis, because visibility hardly depends on it: the arm
+            // must be able to follow those paths as well.
             let turned = [-0.7, -0.35, 0.35, 0.7].iter().all(|t| {
                 let turn = s.grasp_turn_rad + t;
                 let mut path = line(&start, &grasp_pose(turn, STANDOFF_M), 16);
@@ -326,8 +326,8 @@ fn rim_is_free(s: &Scenario, body: &Body, object_from_gripper: &Pose) -> bool {
     })
 }
 
-/// A click of an operator: within two pixels of the outer edge of the painted circle (of the rim on a bare wheel), where it
-/// is unobstructed.
+/// A click of an operator: within two pixels of the outer edge of the painted circle (of the rim on a bare wheel),
+/// where it is unobstructed.
 fn draw_click(s: &Scenario, body: &Body, with_arm: bool, view: View, rng: &mut ChaCha8Rng) -> Option<Pixel> {
     let left_from_object = s.left_from_object();
     let radius = s.stage.wheel.paint_radii().map_or(s.stage.wheel.outer_radius(), |r| r[1]);

@@ -14,8 +14,8 @@ const HALF_PLATE_M: f64 = 0.002;
 
 /// A gripper with nine dark marks on two light wings and on a light tongue near the jaws; the pattern has no symmetry.
 ///
-/// The tongue is 26 mm in front of the plane of the wings. Marks at two depths make the pose well conditioned, and marks
-/// near the jaws make it insensitive to calibration errors.
+/// The tongue is 26 mm in front of the plane of the wings. Marks at two depths make the pose well conditioned, and
+/// marks near the jaws make it insensitive to calibration errors.
 pub fn default_gripper() -> GripperFile {
     let plate = |x: f64, y: f64, z: f64| {
         Isometry3::from_parts(

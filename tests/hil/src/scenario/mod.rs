@@ -1,8 +1,8 @@
 //! A simulated cell: its ground truth, and the calibration that graspd is given.
 //!
-//! [`Scenario::from_seed`] draws a valve, a rig and a start pose at random. [`Scenario::save`] and [`Scenario::load`] store a
-//! cell as a *world*: a folder with the files an integrator would have (`rig.toml`, `gripper.toml`) and, in separate files,
-//! the ground truth.
+//! [`Scenario::from_seed`] draws a valve, a rig and a start pose at random. [`Scenario::save`] and [`Scenario::load`]
+//! store a cell as a *world*: a folder with the files an integrator would have (`rig.toml`, `gripper.toml`) and, in
+//! separate files, the ground truth.
 
 mod circles;
 mod draw;
@@ -49,10 +49,11 @@ pub struct Scenario {
     pub gripper: GripperFile,
     /// Pose of the left camera; ground truth.
     pub base_from_left: Pose,
-    /// Pose of the valve; ground truth. Object frame: origin at the circle's centre, z along the axis towards the cameras.
-    pub base_from_object: Pose,
-    /// Rotation of the grasp about the valve's axis for which the path was checked, rad; the gripper's y axis points to the
+    /// Pose of the valve; ground truth. Object frame: origin at the circle's centre, z along the axis towards the
     /// cameras.
+    pub base_from_object: Pose,
+    /// Rotation of the grasp about the valve's axis for which the path was checked, rad; the gripper's y axis points to
+    /// the cameras.
     pub grasp_turn_rad: f64,
     /// Fixed objects and light.
     pub stage: Stage,
@@ -97,7 +98,8 @@ impl Scenario {
         Snapshot { object_from_gripper: [Some(pose); 2], opening: self.gripper.opening[1], frame, hidden_marks: 0 }
     }
 
-    /// Compares the true gripper pose at joints `q` with the grasp `back` metres off the circle's centre along the axis.
+    /// Compares the true gripper pose at joints `q` with the grasp `back` metres off the circle's centre along the
+    /// axis.
     pub fn truth(&self, q: &Joints, back: f64) -> Truth {
         Truth::of(&self.object_from_gripper(q), back)
     }

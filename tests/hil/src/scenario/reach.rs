@@ -47,9 +47,9 @@ fn sigma_min(dh: &Dh, q: &Joints, flange_from_gripper: &Pose) -> f64 {
     j.singular_values().min()
 }
 
-/// Joint positions along a sequence of gripper poses (base frame), starting near `near`. `None` if the arm cannot follow it
-/// smoothly: out of reach, close to a singularity or joint limit, a change of configuration, or a wrist too close to the
-/// floor or to the arm's column.
+/// Joint positions along a sequence of gripper poses (base frame), starting near `near`. `None` if the arm cannot
+/// follow it smoothly: out of reach, close to a singularity or joint limit, a change of configuration, or a wrist too
+/// close to the floor or to the arm's column.
 pub fn straight_path(
     model: Model,
     dh: &Dh,

@@ -1,7 +1,7 @@
 //! A cell as a folder: the integrator's files and the ground truth.
 //!
-//! graspd may read `rig.toml`, `gripper.toml`, `arm.toml` (kinematics that it is given) and `clicks.json`. `truth.toml`,
-//! `true_rig.toml` and `true_arm.toml` (kinematics of the mock controller) are for the simulators only.
+//! graspd may read `rig.toml`, `gripper.toml`, `arm.toml` (kinematics that it is given) and `clicks.json`.
+//! `truth.toml`, `true_rig.toml` and `true_arm.toml` (kinematics of the mock controller) are for the simulators only.
 
 use super::Scenario;
 use crate::scene::{Sensor, Stage};

@@ -7,7 +7,8 @@ use graspd_rt::geom::{Camera, Pixel, Pose, Vec3};
 
 /// Samples along each side of a pixel in which the valve changes, and in which only the backdrop changes.
 const FINE: [usize; 2] = [10, 4];
-/// Pixels between exactly undistorted rays of a row; the rays between are interpolated, with an error below 0.001 px for any lens.
+/// Pixels between exactly undistorted rays of a row; the rays between are interpolated, with an error below 0.001 px
+/// for any lens.
 const STEP: usize = 4;
 /// Difference of grey between neighbouring pixels above which both are supersampled, grey values.
 const MAX_GREY_STEP: f64 = 5.0;
@@ -205,8 +206,8 @@ impl<'a> Tracer<'a> {
         hits
     }
 
-    /// Averages `side` x `side` samples over the pixel at (`u`, `v`): grey of the backdrop, and of the valve its grey times
-    /// coverage, coverage and smallest distance.
+    /// Averages `side` x `side` samples over the pixel at (`u`, `v`): grey of the backdrop, and of the valve its grey
+    /// times coverage, coverage and smallest distance.
     fn supersample(&self, u: f64, v: f64, side: usize) -> (f32, [f32; 3]) {
         let o = self.object_from_camera.translation.vector;
         let c = self.ray(u, v);
@@ -232,7 +233,8 @@ impl<'a> Tracer<'a> {
     }
 }
 
-/// Blurs an image with rows of `width` pixels in place by a symmetric kernel (centre first); border pixels are repeated.
+/// Blurs an image with rows of `width` pixels in place by a symmetric kernel (centre first); border pixels are
+/// repeated.
 pub(super) fn blur(image: &mut [f32], width: usize, kernel: &[f32], scratch: &mut Vec<f32>) {
     let n = kernel.len() - 1;
     if n == 0 || width == 0 {

@@ -1,7 +1,7 @@
 //! Renderer of the stereo images: a valve on a pipe, and the gripper with its marks.
 //!
-//! The fixed part is ray traced once per view with supersampling. The gripper is drawn into it for every frame with exact
-//! area coverage, lens distortion and occlusion by depth; blur and sensor noise follow.
+//! The fixed part is ray traced once per view with supersampling. The gripper is drawn into it for every frame with
+//! exact area coverage, lens distortion and occlusion by depth; blur and sensor noise follow.
 //!
 //! [`StereoRenderer`] renders; [`crate::scenario`] defines the cell.
 

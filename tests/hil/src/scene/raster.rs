@@ -1,8 +1,8 @@
 //! Exact area coverage of polygons: the covered fraction of each pixel's square.
 //!
-//! Each edge adds the signed area to its right to the pixels that it crosses; a cumulative sum along each row turns that into
-//! coverage. The result is exact up to f32 rounding for any polygon, at the cost of its outline plus its bounding box. There
-//! is no sampling noise, which a sub-pixel tracker would see as motion.
+//! Each edge adds the signed area to its right to the pixels that it crosses; a cumulative sum along each row turns
+//! that into coverage. The result is exact up to f32 rounding for any polygon, at the cost of its outline plus its
+//! bounding box. There is no sampling noise, which a sub-pixel tracker would see as motion.
 
 use graspd_rt::geom::Pixel;
 
@@ -71,8 +71,8 @@ pub(super) struct Coverage {
 }
 
 impl Coverage {
-    /// Computes the coverage of a closed polygon (either orientation) inside `bounds`. Returns its bounding rectangle, `None`
-    /// if it is outside.
+    /// Computes the coverage of a closed polygon (either orientation) inside `bounds`. Returns its bounding rectangle,
+    /// `None` if it is outside.
     pub(super) fn fill(&mut self, polygon: &[Pixel], bounds: Rect) -> Option<Rect> {
         self.rect = None;
         let outer = Rect::around(polygon.iter().copied(), 0.0, bounds.x1, bounds.y1)?;

@@ -27,7 +27,8 @@ impl Default for Sensor {
 
 /// Grey values are kept as 64ths between rendering and the sensor.
 pub(super) const SCALE: f32 = 64.0;
-/// Noise amplitudes and the noise table are both in 2048ths: the upper 16 bits of their product are 64ths of a grey value.
+/// Noise amplitudes and the noise table are both in 2048ths: the upper 16 bits of their product are 64ths of a grey
+/// value.
 const UNIT: f32 = 2048.0;
 /// Entries of the noise table.
 const TABLE_LENGTH: usize = 1 << 18;

@@ -94,8 +94,8 @@ impl Solid {
         sum / n
     }
 
-    /// Smallest signed distance of the solid's corners from the plane of another solid's face: positive if the plane separates
-    /// them.
+    /// Smallest signed distance of the solid's corners from the plane of another solid's face: positive if the plane
+    /// separates them.
     fn beyond(&self, face: &Face) -> f64 {
         let Some(o) = face.corners.first() else { return f64::INFINITY };
         self.faces.iter().flat_map(|f| &f.corners).map(|p| face.normal.dot(&(p - o))).fold(f64::INFINITY, f64::min)
@@ -127,8 +127,8 @@ impl Solid {
 
 /// Painting order, far to near, of disjoint convex solids (camera frame, camera at the origin).
 ///
-/// Of two solids, the one on the camera's side of a separating face plane can occlude the other and is painted later. Solids
-/// without a separating face plane are ordered by distance.
+/// Of two solids, the one on the camera's side of a separating face plane can occlude the other and is painted later.
+/// Solids without a separating face plane are ordered by distance.
 pub(super) fn paint_order(solids: &[Solid]) -> Vec<usize> {
     let n = solids.len();
     // before[i][j]: i must be painted before j.
@@ -164,8 +164,8 @@ pub(super) fn paint_order(solids: &[Solid]) -> Vec<usize> {
     order
 }
 
-/// Projects a polygon (camera frame) through the lens: clips it to the field of view and divides its edges into `pieces`,
-/// because distortion bends them.
+/// Projects a polygon (camera frame) through the lens: clips it to the field of view and divides its edges into
+/// `pieces`, because distortion bends them.
 ///
 /// `out` receives the outline in pixels; it is empty if nothing is in the field of view.
 pub(super) fn project(

@@ -115,7 +115,8 @@ impl Stage {
         (t > 0.0).then(|| (t, (oo + dd * t) / self.pipe_radius_m))
     }
 
-    /// Fraction of direct light at a point: shadows of valve and pipe, with a penumbra from the distance to the occluder.
+    /// Fraction of direct light at a point: shadows of valve and pipe, with a penumbra from the distance to the
+    /// occluder.
     fn lit(&self, p: &Vec3) -> f64 {
         let l = self.light();
         if self.pipe(p, &l).is_some_and(|(t, _)| t > 1e-3) {

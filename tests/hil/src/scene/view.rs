@@ -104,8 +104,8 @@ impl ViewRenderer {
         }
     }
 
-    /// Draws the gripper over the fixed layers and blurs. Returns the rectangle held by `work.image`, and the part of it in
-    /// which the blur is correct (at its border neighbouring pixels were missing).
+    /// Draws the gripper over the fixed layers and blurs. Returns the rectangle held by `work.image`, and the part of
+    /// it in which the blur is correct (at its border neighbouring pixels were missing).
     fn draw_gripper(&mut self, stage: &Stage, m: &Moving<'_>) -> Option<(Rect, Rect)> {
         let (w, h) = (self.layers.width, self.layers.height);
         let camera_from_gripper = self.camera_from_object * m.object_from_gripper;

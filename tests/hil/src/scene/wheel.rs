@@ -1,8 +1,9 @@
-//! The valve: a torus with spokes, hub and stem and an optional painted circle on its crest; rendered by sphere tracing.
+//! The valve: a torus with spokes, hub and stem and an optional painted circle on its crest; rendered by sphere
+//! tracing.
 //!
-//! Everything is in the object frame, z along the valve's axis towards the cameras. With a painted band the origin is at the
-//! centre of the plane of the band's two edges, which are the circles that a camera sees. Without one it is at the centre of
-//! the bar's core circle.
+//! Everything is in the object frame, z along the valve's axis towards the cameras. With a painted band the origin is
+//! at the centre of the plane of the band's two edges, which are the circles that a camera sees. Without one it is at
+//! the centre of the bar's core circle.
 
 use graspd_rt::geom::Vec3;
 
@@ -52,7 +53,8 @@ impl Wheel {
         if self.paint_width_m > 0.0 { -self.bar_radius_m * self.paint_half_angle().cos() } else { 0.0 }
     }
 
-    /// Radii of the inner and outer edge of the painted band, which are in the plane z = 0, metres; `None` without paint.
+    /// Radii of the inner and outer edge of the painted band, which are in the plane z = 0, metres; `None` without
+    /// paint.
     pub fn paint_radii(&self) -> Option<[f64; 2]> {
         (self.paint_width_m > 0.0).then(|| {
             let d = self.bar_radius_m * self.paint_half_angle().sin();

@@ -5,11 +5,11 @@ use crate::scenario::Options;
 use clap::Parser;
 use std::path::PathBuf;
 
-/// Two simulated cameras: renders valve, gripper and marks for the arm's joints and publishes stereo pairs as a camera driver
-/// does.
+/// Two simulated cameras: renders valve, gripper and marks for the arm's joints and publishes stereo pairs as a camera
+/// driver does.
 ///
-/// It reads the joints from a UR controller (or the mock) as a second, read-only RTDE client. It prints one line of JSON once
-/// images are published. It accepts lines of JSON on standard input (and on --control-port): {"ask":"truth"},
+/// It reads the joints from a UR controller (or the mock) as a second, read-only RTDE client. It prints one line of
+/// JSON once images are published. It accepts lines of JSON on standard input (and on --control-port): {"ask":"truth"},
 /// {"ask":"status"}, {"fault":"freeze"}, {"ask":"faults"}, {"clear":true}, {"quit":true}.
 #[derive(Parser, Debug, Clone)]
 #[command(name = "graspd-scene", version)]

@@ -3,7 +3,8 @@
 use graspd_shm::frame::{StereoHeader, flags};
 use serde::{Deserialize, Serialize};
 
-/// One fault. As a line of JSON: `{"fault":"skew","ms":8,"after_s":2,"for_s":1}`. `eye` selects a camera: 0 left, 1 right.
+/// One fault. As a line of JSON: `{"fault":"skew","ms":8,"after_s":2,"for_s":1}`. `eye` selects a camera: 0 left, 1
+/// right.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "fault", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Fault {
@@ -42,8 +43,8 @@ pub enum Fault {
         #[serde(default)]
         ids: bool,
     },
-    /// Writes a wrong value into a header field: `width`, `height`, `stride`, `pixel_format`, `magic`, `layout_version`,
-    /// `header_size`, `offset`, `size`, `sequence_end`, `camera_id`, `calibration_id`, `flags`.
+    /// Writes a wrong value into a header field: `width`, `height`, `stride`, `pixel_format`, `magic`,
+    /// `layout_version`, `header_size`, `offset`, `size`, `sequence_end`, `camera_id`, `calibration_id`, `flags`.
     Header {
         /// Field.
         field: String,

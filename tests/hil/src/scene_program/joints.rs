@@ -170,11 +170,11 @@ impl Arm {
     }
 }
 
-/// Maps controller time to host time. A package can be late but never early, so the smallest recent delay is the offset of the
-/// clocks.
+/// Maps controller time to host time. A package can be late but never early, so the smallest recent delay is the offset
+/// of the clocks.
 ///
-/// "Recent" is 25 to 50 packages: longer than any delay of this program's reads, and short enough to follow a mock whose clock
-/// lost time because the host stalled it.
+/// "Recent" is 25 to 50 packages: longer than any delay of this program's reads, and short enough to follow a mock
+/// whose clock lost time because the host stalled it.
 #[derive(Debug, Default)]
 struct ClockMap {
     /// Smallest host minus controller time, ns, in the present and in the previous window.

@@ -17,7 +17,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Serial numbers of the simulated cameras.
 pub(super) const SERIALS: [&str; 2] = ["sim-left", "sim-right"];
-/// Exposure time in the frame header, ns. Images show one instant: at servo speeds motion blur is a fraction of a pixel.
+/// Exposure time in the frame header, ns. Images show one instant: at servo speeds motion blur is a fraction of a
+/// pixel.
 const EXPOSURE_NS: u64 = 2_000_000;
 /// Longest wait for an arm sample taken after the exposure, ns.
 const MAX_SAMPLE_WAIT_NS: u64 = 8_000_000;
@@ -178,8 +179,8 @@ impl Loop {
         Ok(())
     }
 
-    /// Waits for an arm sample taken after the exposure, so that the joints can be interpolated. False if a connected and
-    /// sending controller was late.
+    /// Waits for an arm sample taken after the exposure, so that the joints can be interpolated. False if a connected
+    /// and sending controller was late.
     fn wait_for_arm(&self, capture: u64) -> bool {
         if !self.arm.link().0 {
             return true;

@@ -17,8 +17,8 @@ pub enum Upload {
     StopProgram,
 }
 
-/// Collects uploads: a `def` or `sec` up to its matching `end`, or any other single line. As on the controller, a line takes
-/// effect only after its newline.
+/// Collects uploads: a `def` or `sec` up to its matching `end`, or any other single line. As on the controller, a line
+/// takes effect only after its newline.
 #[derive(Debug, Default)]
 pub struct Collector {
     bytes: Vec<u8>,

@@ -1,4 +1,5 @@
-//! Compiler from the syntax tree to code of a stack machine. The explicit stack lets a script block within nested calls.
+//! Compiler from the syntax tree to code of a stack machine. The explicit stack lets a script block within nested
+//! calls.
 
 use super::ast::{Argument, BinaryOp, Expr, ExprKind, Function, FunctionKind, Scope, Stmt, StmtKind, UnaryOp};
 use super::error::ScriptError;
@@ -94,7 +95,8 @@ struct Loop {
     breaks: Vec<usize>,
 }
 
-/// Compiles a statement of interpreter mode, which sees the program's global variables and functions. Returns its routine.
+/// Compiles a statement of interpreter mode, which sees the program's global variables and functions. Returns its
+/// routine.
 pub(crate) fn extend(program: &mut Program, text: &[Stmt]) -> Result<usize, ScriptError> {
     let id = program.routines.len();
     let mut c = Compiler {

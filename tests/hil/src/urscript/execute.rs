@@ -269,8 +269,8 @@ impl Machine {
         }
     }
 
-    /// Condition of `if` and `while`. UR's own driver script uses a number (`if has_qnear:`), so a number other than zero is true.
-    /// `and`, `or` and `not` accept booleans only.
+    /// Condition of `if` and `while`. UR's own driver script uses a number (`if has_qnear:`), so a number other than
+    /// zero is true. `and`, `or` and `not` accept booleans only.
     fn pop_condition(&mut self, i: usize) -> Result<bool, String> {
         match self.pop(i) {
             Value::Int(n) => Ok(n != 0),

@@ -1,4 +1,5 @@
-//! Parser of expressions. Precedence, lowest first: `or`, `xor`, `and`, `not`, comparison, sum, product, sign, index and call.
+//! Parser of expressions. Precedence, lowest first: `or`, `xor`, `and`, `not`, comparison, sum, product, sign, index
+//! and call.
 
 use super::ast::{Argument, BinaryOp, Expr, ExprKind, UnaryOp};
 use super::error::ScriptError;

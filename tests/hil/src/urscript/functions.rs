@@ -5,7 +5,8 @@
 use super::arithmetic::Outcome;
 use super::value::Value;
 
-/// Functions that are implemented, with their parameters: `name` is required, `name=default` optional; `name=?` is optional without a default.
+/// Functions that are implemented, with their parameters: `name` is required, `name=default` optional; `name=?` is
+/// optional without a default.
 const IMPLEMENTED: &[(&str, &str)] = &[
     // Motion; defaults of the script manual.
     ("movej", "q a=1.4 v=1.05 t=0 r=0"),
@@ -326,7 +327,8 @@ pub(crate) fn bind(function: &str, given: Vec<Value>, names: &[Option<String>]) 
     Some(bind_to(function, &parameters, given, names))
 }
 
-/// Binds positional and named arguments. `t_min` is the name of `t` in manuals before software 3.0, which urx still uses.
+/// Binds positional and named arguments. `t_min` is the name of `t` in manuals before software 3.0, which urx still
+/// uses.
 fn bind_to(
     function: &str,
     parameters: &[(&str, Option<&str>)],

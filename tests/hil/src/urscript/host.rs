@@ -1,8 +1,8 @@
 //! The interface between a script and the controller.
 //!
-//! A host owns dynamics, registers and connections. The interpreter checks argument counts, types and finiteness before a call;
-//! the host checks ranges and states and refuses with a [`HostError`], which stops the program at the line of the call.
-//! Blocking functions are polled in each later control step.
+//! A host owns dynamics, registers and connections. The interpreter checks argument counts, types and finiteness before
+//! a call; the host checks ranges and states and refuses with a [`HostError`], which stops the program at the line of
+//! the call. Blocking functions are polled in each later control step.
 
 use super::error::{HostError, RuntimeError};
 use super::value::Value;
@@ -11,11 +11,12 @@ use super::value::Value;
 pub const JOINTS: usize = 6;
 /// Joint values, base to wrist 3: rad, rad/s or Nm.
 pub type JointVector = [f64; JOINTS];
-/// Position in metres and rotation vector in radians (or a twist, or a wrench), robot base frame unless stated otherwise.
+/// Position in metres and rotation vector in radians (or a twist, or a wrench), robot base frame unless stated
+/// otherwise.
 pub type PoseVector = [f64; 6];
 
-/// Target of a move. The host converts a joint target of a linear move with its forward kinematics, and a pose target of
-/// `movej` with its inverse kinematics.
+/// Target of a move. The host converts a joint target of a linear move with its forward kinematics, and a pose target
+/// of `movej` with its inverse kinematics.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Target {
     /// Joint positions, rad.
@@ -40,8 +41,8 @@ pub enum Motion {
     ServoJ { q: JointVector, a: f64, v: f64, t: f64, lookahead_time: f64, gain: f64 },
     /// Circular servo to a pose.
     ServoC { target: Target, a: f64, v: f64, r: f64 },
-    /// Joint speeds. The arm KEEPS MOVING after the call has returned, until another motion call, a stop or the end of the
-    /// program. The call returns after `t` if that is given, otherwise when the speed is reached.
+    /// Joint speeds. The arm KEEPS MOVING after the call has returned, until another motion call, a stop or the end of
+    /// the program. The call returns after `t` if that is given, otherwise when the speed is reached.
     SpeedJ { qd: JointVector, a: f64, t: f64 },
     /// Tool twist in the base frame; `a_rot` is 0 if it equals `a`. Continues like `SpeedJ`.
     SpeedL { xd: PoseVector, a: f64, t: f64, a_rot: f64 },
@@ -220,8 +221,8 @@ pub enum StepOutcome {
     Failed(RuntimeError),
 }
 
-/// The controller as seen by a script. Required methods are those of motion control; the defaults of the others report that
-/// the feature is missing.
+/// The controller as seen by a script. Required methods are those of motion control; the defaults of the others report
+/// that the feature is missing.
 pub trait Host {
     /// Control step in seconds: 0.002 (e-Series) or 0.008 (CB3).
     fn step_time(&self) -> f64;
@@ -249,8 +250,8 @@ pub trait Host {
     fn motion_start(&mut self, motion: &Motion) -> Result<(), HostError>;
     /// Polled in each later step while a thread waits for the motion that it started.
     fn motion_poll(&mut self) -> MotionStatus;
-    /// The waiting thread was killed, or the program ended during the motion, so it is no longer polled. Moves must come to a
-    /// stop; speed motions continue until the next motion call (the host stops them when the program ends).
+    /// The waiting thread was killed, or the program ended during the motion, so it is no longer polled. Moves must
+    /// come to a stop; speed motions continue until the next motion call (the host stops them when the program ends).
     fn motion_abandon(&mut self);
 
     /// TCP pose at joint positions `q`; `tcp` is the TCP in the flange frame, `None` for the active one.
@@ -345,7 +346,8 @@ pub trait Host {
         Remote::Failed("no such call".to_owned())
     }
 
-    /// A function that is accepted without effect, with its arguments: may be refused in a state that does not allow it.
+    /// A function that is accepted without effect, with its arguments: may be refused in a state that does not allow
+    /// it.
     ///
     /// # Errors
     /// Refused in this state.

@@ -124,11 +124,12 @@ impl Machine {
             return ended.clone();
         }
         let mut i = 0;
-        // Threads started in this step are appended and run in it. The number of threads, including ended ones, is bounded.
+        // Threads started in this step are appended and run in it. The number of threads, including ended ones, is
+        // bounded.
         while i < self.threads.len() {
-            // A thread runs until it waits, so a critical section is not interrupted between two waits. While its thread waits
-            // inside the section the other threads run: UR's own driver script reads its socket inside a critical section while
-            // its servo thread moves the arm.
+            // A thread runs until it waits, so a critical section is not interrupted between two waits. While its
+            // thread waits inside the section the other threads run: UR's own driver script reads its socket inside a
+            // critical section while its servo thread moves the arm.
             if self.threads[i].dead {
                 i += 1;
                 continue;

@@ -125,8 +125,8 @@ impl<'t> Parser<'t> {
 
     /// Parses statements up to one of the closing words (not consumed), or to the end of the text if there are none.
     ///
-    /// A line may hold several statements: a name cannot continue an expression, so it begins the next statement. Programs in
-    /// the field write `x = -0.2 show(x)`, and interpreter mode needs functions on one line.
+    /// A line may hold several statements: a name cannot continue an expression, so it begins the next statement.
+    /// Programs in the field write `x = -0.2 show(x)`, and interpreter mode needs functions on one line.
     fn block(&mut self, closers: &[&str]) -> Result<Vec<Stmt>, ScriptError> {
         self.deeper()?;
         let opened = self.line();

@@ -1,7 +1,7 @@
 //! XML-RPC: handles of `rpc_factory`, and the encoding of calls and responses.
 //!
-//! Types: integer `int`, float `double`, boolean, string, list `array`, struct `struct`; a pose is a struct of x, y, z, rx, ry
-//! and rz, as on the controller.
+//! Types: integer `int`, float `double`, boolean, string, list `array`, struct `struct`; a pose is a struct of x, y, z,
+//! rx, ry and rz, as on the controller.
 
 use super::arithmetic::{Outcome, bounded};
 use super::host::{Host, Remote};

@@ -1,4 +1,5 @@
-//! The layout rules of CONTRIBUTING.md, held against the sources: folders and files depend in one direction, functions stay short.
+//! The layout rules of CONTRIBUTING.md, held against the sources: folders and files depend in one direction, functions
+//! stay short.
 
 mod sources;
 
