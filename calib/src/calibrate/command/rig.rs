@@ -1,6 +1,7 @@
 //! `graspd calibrate rig`.
 
 use super::{Answer, Failure, Outcome, RigRequest, input, usage};
+use crate::calibrate::rig::holdout::FOLDS;
 use crate::calibrate::rig::score::{mean, quantile, rms};
 use crate::calibrate::rig::solve::Lens;
 use crate::calibrate::rig::{Calibration, Options, Pair, calibrate};
@@ -158,16 +159,7 @@ fn words(c: &Collected, k: &Calibration, notes: &[String], out: Option<&Path>) -
         rig.right_from_left.rotation.angle().to_degrees(),
         sigma(28).to_degrees()
     ));
-    line(format!(
-        "held out (4 groups): epipolar {:.3} px RMS, {:.3} px P95; squares {:.3} % RMS, {:+.3} % mean; diagonals {:.3} % RMS; {} of {} points evaluated",
-        rms(&s.epipolar_px),
-        quantile(&s.epipolar_px, 0.95),
-        100.0 * rms(&s.squares),
-        100.0 * mean(&s.squares),
-        100.0 * rms(&s.diagonals),
-        s.evaluated,
-        s.expected
-    ));
+    line(format!("held out ({FOLDS} groups): {}", s.summary()));
     line(format!(
         "reprojection {:.3} px RMS in the fit, {:.3} px held out",
         k.fit.rms_px(),

@@ -98,19 +98,7 @@ fn figures(h: &mut String, k: &Calibration) {
             t.rotation.angle().to_degrees()
         ),
     );
-    row(
-        "held out",
-        format!(
-            "epipolar {:.3} px RMS, {:.3} px P95; squares {:.3} % RMS, {:+.3} % mean; diagonals {:.3} % RMS; {} of {} points evaluated",
-            rms(&s.epipolar_px),
-            quantile(&s.epipolar_px, 0.95),
-            100.0 * rms(&s.squares),
-            100.0 * mean(&s.squares),
-            100.0 * rms(&s.diagonals),
-            s.evaluated,
-            s.expected
-        ),
-    );
+    row("held out", s.summary());
     row(
         "reprojection",
         format!("{:.3} px RMS in the fit, {:.3} px held out", k.fit.rms_px(), rms(&k.holdout.reprojection_px)),

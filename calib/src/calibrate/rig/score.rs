@@ -22,7 +22,21 @@ pub struct Scores {
 }
 
 impl Scores {
-    /// Adds another set's.
+    /// The figures in one line.
+    pub fn summary(&self) -> String {
+        format!(
+            "epipolar {:.3} px RMS, {:.3} px P95; squares {:.3} % RMS, {:+.3} % mean; diagonals {:.3} % RMS; {} of {} points evaluated",
+            rms(&self.epipolar_px),
+            quantile(&self.epipolar_px, 0.95),
+            100.0 * rms(&self.squares),
+            100.0 * mean(&self.squares),
+            100.0 * rms(&self.diagonals),
+            self.evaluated,
+            self.expected
+        )
+    }
+
+    /// Adds the figures of another set.
     pub fn extend(&mut self, other: Scores) {
         self.epipolar_px.extend(other.epipolar_px);
         self.squares.extend(other.squares);

@@ -1,7 +1,7 @@
 //! A ChArUco board: labels by its markers, every corner measured anew.
 
+use super::GreyImage;
 use super::chessboard::steps;
-use super::images::GreyImage;
 use super::spec::{Kind, Target};
 use super::{Found, NotFound, Seen, saddle};
 use calib_targets_charuco::{CharucoBoardSpec, CharucoDetector, CharucoParams, GrayImageView};

@@ -1,7 +1,7 @@
 //! A chessboard: the grid by a topological detector, every corner measured anew, labels by the board's size and
 //! colours.
 
-use super::images::GreyImage;
+use super::GreyImage;
 use super::saddle::{self, Saddle};
 use super::spec::Target;
 use super::{Found, NotFound, Seen};

@@ -3,7 +3,7 @@
 //! The centroid is that of the disc's image. It is not the image of the disc's centre; the bundle, which knows pose and
 //! lens, predicts the centroid and so removes the difference.
 
-use super::images::GreyImage;
+use super::GreyImage;
 use super::spec::Target;
 use super::{Found, NotFound, Seen};
 use graspd_rt::geom::Pixel;

@@ -1,77 +1,24 @@
 //! Image files: which there are, and their grey values, one at a time.
 
-use graspd_rt::image::ImageView;
+use crate::offline::edges::grey_image::GreyImage;
 use image::{ColorType, DynamicImage, ImageDecoder, ImageReader};
 use std::path::{Path, PathBuf};
 
-/// Most pixels of an image that is read: a camera has fewer, and more would fill the memory.
-const MOST_PIXELS: u64 = 120_000_000;
-/// Most files that one pattern may name.
-const MOST_FILES: usize = 20_000;
-
-/// An image of eight bits a pixel.
-#[derive(Clone, Debug, PartialEq)]
-pub struct GreyImage {
-    width: usize,
-    height: usize,
-    data: Vec<u8>,
-}
-
-impl GreyImage {
-    /// An image from its grey values, row by row; `None` where their number is not `width * height`.
-    pub fn new(width: usize, height: usize, data: Vec<u8>) -> Option<Self> {
-        (width > 0 && height > 0 && data.len() == width.checked_mul(height)?).then_some(Self { width, height, data })
-    }
-
-    /// A copy of a live frame's view.
-    pub fn copy_of(view: &ImageView<'_>) -> Self {
-        let data = (0..view.height()).flat_map(|y| view.row(y)).copied().collect();
-        Self { width: view.width(), height: view.height(), data }
-    }
-
-    /// Width, pixels.
-    pub fn width(&self) -> usize {
-        self.width
-    }
-
-    /// Height, pixels.
-    pub fn height(&self) -> usize {
-        self.height
-    }
-
-    /// The grey values, row by row.
-    pub fn data(&self) -> &[u8] {
-        &self.data
-    }
-
-    /// The grey value at a pixel; 0 outside.
-    pub fn at(&self, x: usize, y: usize) -> u8 {
-        if x < self.width { self.data.get(y * self.width + x).copied().unwrap_or(0) } else { 0 }
-    }
-
-    /// Half the size, each pixel the mean of four.
-    pub fn halved(&self) -> Option<Self> {
-        let (w, h) = (self.width / 2, self.height / 2);
-        let mean = |x: usize, y: usize| {
-            let p = |i, j| u16::from(self.at(2 * x + i, 2 * y + j));
-            ((p(0, 0) + p(1, 0) + p(0, 1) + p(1, 1) + 2) / 4) as u8
-        };
-        let data = (0..h).flat_map(|y| (0..w).map(move |x| (x, y))).map(|(x, y)| mean(x, y)).collect();
-        Self::new(w, h, data)
-    }
-}
+/// Maximum number of pixels of an image that is read: cameras have fewer, and more would fill the memory.
+const MAX_PIXELS: u64 = 120_000_000;
+/// Maximum number of files that one pattern may match.
+const MAX_FILES: usize = 20_000;
 
 /// What is known of an image file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImageFile {
     /// The image.
     pub grey: GreyImage,
-    /// The file says that its image is to be turned for display (a phone or an editor does that, a camera driver does
-    /// not).
+    /// The file's EXIF tag asks for a rotation for display (phones and editors write it, camera drivers do not).
     pub turned: bool,
 }
 
-/// Why images cannot be had.
+/// Why images cannot be read.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ImageError {
     /// The pattern cannot be read.
@@ -98,7 +45,7 @@ pub enum ImageError {
 /// `left10`).
 ///
 /// # Errors
-/// A pattern that is none, names nothing, or names too much.
+/// An invalid pattern, one that matches no file, or one that matches too many.
 pub fn list_images(option: &str, pattern: &str) -> Result<Vec<PathBuf>, ImageError> {
     let refuse =
         |problem: String| ImageError::Pattern { option: option.to_owned(), pattern: pattern.to_owned(), problem };
@@ -113,19 +60,19 @@ pub fn list_images(option: &str, pattern: &str) -> Result<Vec<PathBuf>, ImageErr
             if is_image(&path) {
                 files.push(path);
             }
-            if files.len() > MOST_FILES {
+            if files.len() > MAX_FILES {
                 break;
             }
         }
     } else {
         let found = glob::glob(pattern).map_err(|e| refuse(e.msg.to_owned()))?;
-        files.extend(found.filter_map(Result::ok).filter(|p| p.is_file()).take(MOST_FILES + 1));
+        files.extend(found.filter_map(Result::ok).filter(|p| p.is_file()).take(MAX_FILES + 1));
     }
     if files.is_empty() {
-        return Err(refuse("no image file has that name".to_owned()));
+        return Err(refuse("no image file matches".to_owned()));
     }
-    if files.len() > MOST_FILES {
-        return Err(refuse(format!("it names more than {MOST_FILES} files")));
+    if files.len() > MAX_FILES {
+        return Err(refuse(format!("it matches more than {MAX_FILES} files")));
     }
     files.sort_by_cached_key(|p| natural_key(&p.to_string_lossy()));
     Ok(files)
@@ -153,25 +100,26 @@ fn natural_key(name: &str) -> Vec<(u128, String)> {
     out
 }
 
-/// Reads an image: colour becomes grey, 16 bits become 8 by the bits that are in use. It is not turned, whatever its
-/// tag says: a calibration belongs to the sensor's rows and columns.
+/// Reads an image: colour becomes grey, 16 bits become 8 by the bits that are in use. It is not rotated, whatever its
+/// EXIF tag says: a calibration belongs to the sensor's rows and columns.
 ///
 /// # Errors
 /// What is wrong with the file.
 pub fn read_image(path: &Path) -> Result<ImageFile, ImageError> {
     let refuse = |problem: String| ImageError::File { path: path.display().to_string(), problem };
-    let words = |e: &dyn std::fmt::Display| e.to_string();
-    let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(|e| refuse(words(&e)))?;
-    let mut decoder = reader.into_decoder().map_err(|e| refuse(words(&e)))?;
+    let reader =
+        ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(|e| refuse(e.to_string()))?;
+    let mut decoder = reader.into_decoder().map_err(|e| refuse(e.to_string()))?;
     let (w, h) = decoder.dimensions();
-    if w == 0 || h == 0 || u64::from(w) * u64::from(h) > MOST_PIXELS {
-        return Err(refuse(format!("{w}x{h} pixels are not the size of a camera image")));
+    if w == 0 || h == 0 || u64::from(w) * u64::from(h) > MAX_PIXELS {
+        return Err(refuse(format!("{w}x{h} pixels is not the size of a camera image")));
     }
     let turned = decoder.orientation().is_ok_and(|o| o != image::metadata::Orientation::NoTransforms);
     let deep = matches!(decoder.color_type(), ColorType::L16 | ColorType::La16 | ColorType::Rgb16 | ColorType::Rgba16);
-    let image = DynamicImage::from_decoder(decoder).map_err(|e| refuse(words(&e)))?;
+    let image = DynamicImage::from_decoder(decoder).map_err(|e| refuse(e.to_string()))?;
     let grey = if deep { shallow(&image.into_luma16()) } else { image.into_luma8().into_raw() };
-    let grey = GreyImage::new(w as usize, h as usize, grey).ok_or_else(|| refuse("it is cut off".to_owned()))?;
+    let grey =
+        GreyImage::new(w as usize, h as usize, grey).ok_or_else(|| refuse("the file is truncated".to_owned()))?;
     Ok(ImageFile { grey, turned })
 }
 

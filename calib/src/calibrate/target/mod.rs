@@ -10,8 +10,9 @@ mod spec;
 #[cfg(test)]
 mod tests;
 
+pub use crate::offline::edges::grey_image::GreyImage;
 pub use collect::{CollectError, Collected, FoundPair, collect};
-pub use images::{GreyImage, ImageError, ImageFile, list_images, read_image};
+pub use images::{ImageError, ImageFile, list_images, read_image};
 pub use spec::{Kind, Target, TargetError};
 
 use graspd_rt::geom::Pixel;

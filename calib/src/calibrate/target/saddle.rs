@@ -4,7 +4,7 @@
 //! corner. It is symmetric about the corner, and so is the window, so that neither the edges' true profile nor their
 //! blur moves it.
 
-use super::images::GreyImage;
+use super::GreyImage;
 use graspd_rt::geom::Pixel;
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 

@@ -66,6 +66,22 @@ impl GreyImage {
         self.data.get(y * self.width..(y + 1) * self.width).unwrap_or(&[])
     }
 
+    /// The grey value at a pixel; 0 outside.
+    pub fn at(&self, x: usize, y: usize) -> u8 {
+        if x < self.width { self.data.get(y * self.width + x).copied().unwrap_or(0) } else { 0 }
+    }
+
+    /// Half the size, each pixel the mean of four; `None` for an image of one row or column.
+    pub fn halved(&self) -> Option<Self> {
+        let (w, h) = (self.width / 2, self.height / 2);
+        let mean = |x: usize, y: usize| {
+            let p = |i, j| u16::from(self.at(2 * x + i, 2 * y + j));
+            ((p(0, 0) + p(1, 0) + p(0, 1) + p(1, 1) + 2) / 4) as u8
+        };
+        let data = (0..h).flat_map(|y| (0..w).map(move |x| (x, y))).map(|(x, y)| mean(x, y)).collect();
+        Self::new(w, h, data)
+    }
+
     /// Borrows the image as the type that the on-line stage uses.
     pub fn view(&self) -> Option<ImageView<'_>> {
         ImageView::new(&self.data, self.width, self.height, self.width)
