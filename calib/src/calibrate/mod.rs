@@ -1,10 +1,10 @@
-//! Calibration: from images of a target to a rig file that says how good it is.
+//! Calibration of the rig and of the gripper.
 //!
-//! 1. [`target`]: what is printed on the board, and where its points are in an image, with their covariances.
-//! 2. [`rig`]: from those points in both views to the rig: start values, joint bundle, wrong pairs, hold-out, coverage,
-//!    verdict.
-//! 3. [`gripper`]: from marks and joints of an arm at rest to marks, mounting and the rig's pose in the arm's base.
-//! 4. [`report`]: what people look at; [`command`]: options in, files and figures out.
+//! 1. [`target`]: the printed pattern, and detection of its points in an image with their covariances.
+//! 2. [`rig`]: estimates the rig from these points in both views: start values, joint bundle, tests of the pairs,
+//!    hold-out, coverage, verdict.
+//! 3. [`gripper`]: estimates marks, mounting and the rig's pose in the arm's base from recordings of an arm at rest.
+//! 4. [`report`]: the HTML report. [`command`]: the subcommands without command-line parsing.
 
 pub mod command;
 pub mod gripper;

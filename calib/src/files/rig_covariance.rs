@@ -1,29 +1,29 @@
-//! The joint covariance of a rig's parameters, as it stands in `rig.toml`.
+//! The joint covariance of a rig's parameters in `rig.toml`.
 
 use super::error::{FileError, Source};
 use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
 
-/// Covariance of the calibrated parameters: standard deviations and correlations, so that people can read it.
+/// Covariance of the calibrated parameters, stored as standard deviations and correlations for readability.
 ///
-/// Names are those of `rig.toml` ("left.fx", "right.k1"), and "right_from_left.x .. rz" for a small motion of the right
-/// camera in its own frame (metres, radians): x_right = exp(twist) right_from_left x_left.
+/// Parameter names are those of `rig.toml` ("left.fx", "right.k1"). "right_from_left.x .. rz" is a small motion of the
+/// right camera in its own frame (metres, radians): x_right = exp(twist) right_from_left x_left.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RigCovariance {
-    /// Which parameter each row is.
+    /// Parameter name of each row.
     pub parameters: Vec<String>,
-    /// Standard deviations, in the parameter's own unit.
+    /// Standard deviations, each in the unit of its parameter.
     pub sigma: Vec<f64>,
-    /// Correlations, lower triangle by rows, the diagonal left out: the first row is empty.
+    /// Correlations: lower triangle by rows without the diagonal, so that the first row is empty.
     pub correlation: Vec<Vec<f64>>,
 }
 
 impl RigCovariance {
-    /// From a covariance matrix with one name a row.
+    /// From a covariance matrix with one parameter name per row.
     pub fn of(names: &[&str], covariance: &DMatrix<f64>) -> Self {
         let sigma: Vec<f64> = (0..names.len()).map(|k| covariance[(k, k)].max(0.0).sqrt()).collect();
-        // Six digits of a correlation say more than any use of it needs, and keep the file readable.
+        // Six digits of a correlation are more than any use of it needs, and keep the file readable.
         let round = |v: f64| (v * 1e6).round() / 1e6 + 0.0;
         let correlation = (0..names.len())
             .map(|i| {
@@ -48,7 +48,7 @@ impl RigCovariance {
         })
     }
 
-    /// Refuses what is no covariance.
+    /// Checks sizes and value ranges.
     pub(super) fn check(&self, src: &Source<'_>) -> Result<(), FileError> {
         let n = self.parameters.len();
         let shape = self.sigma.len() == n
@@ -58,15 +58,20 @@ impl RigCovariance {
             return Err(src.refuse(
                 "covariance.correlation",
                 format!("{} parameters, {} sigmas, {} rows", n, self.sigma.len(), self.correlation.len()),
-                "the parts of the covariance do not have one size",
-                "keep the table as graspd calibrate wrote it, or take it out",
+                "parameters, sigma and correlation differ in size",
+                "keep the table as graspd calibrate wrote it, or remove it",
             ));
         }
         if let Some(s) = self.sigma.iter().find(|s| !(**s >= 0.0 && s.is_finite())) {
-            return Err(src.refuse("covariance.sigma", s, "not a standard deviation", "give numbers from 0 on"));
+            return Err(src.refuse(
+                "covariance.sigma",
+                s,
+                "not a standard deviation",
+                "use finite numbers not below 0",
+            ));
         }
         if let Some(r) = self.correlation.iter().flatten().find(|r| !(r.abs() <= 1.0)) {
-            return Err(src.refuse("covariance.correlation", r, "not a correlation", "give numbers from -1 to 1"));
+            return Err(src.refuse("covariance.correlation", r, "not a correlation", "use numbers from -1 to 1"));
         }
         Ok(())
     }

@@ -1,10 +1,10 @@
-//! What a calibration command prints, and the code it ends with.
+//! Output and exit code of the calibration commands.
 
 use crate::exit::{Exit, Failure};
 use graspd_calib::calibrate::command::{Answer, Outcome};
 use std::io::Write;
 
-/// Prints the answer; how it ended says with which code the program ends.
+/// Prints the outcome and maps it to an exit code.
 pub(super) fn finish(json: bool, outcome: Outcome) -> Result<Exit, Failure> {
     if json {
         let _ = writeln!(std::io::stdout(), "{}", outcome.json);

@@ -1,4 +1,4 @@
-//! `graspd calibrate`: one subcommand a thing that is calibrated, and one that asks whether a calibration still holds.
+//! `graspd calibrate`: calibrates the rig or the gripper, records the data for it, and checks a stored calibration.
 
 use super::answer::finish;
 use crate::exit::{Exit, Failure};
@@ -7,33 +7,33 @@ use graspd_calib::calibrate::command;
 use graspd_calib::files::keep_apart;
 use std::path::PathBuf;
 
-/// What can be calibrated.
+/// Calibration subcommands.
 #[derive(Debug, Subcommand)]
 pub enum CalibrateCommand {
-    /// The stereo rig, from image pairs of a target that is moved by hand
+    /// Calibrate the stereo rig from image pairs of a target that is moved by hand
     Rig(Box<CalibrateRigArgs>),
-    /// The gripper at the arm: marks, mounting and the rig's pose, from a recording; moves nothing
+    /// Calibrate the gripper from a recording: marks, mounting and the rig's pose; does not move the arm
     Gripper(super::calibrate_gripper::CalibrateGripperArgs),
-    /// Record marks and joints whenever the arm is at rest, from a running daemon; moves nothing
+    /// Record marks and joints from a running daemon whenever the arm is at rest; does not move the arm
     Record(super::calibrate_gripper::CalibrateRecordArgs),
-    /// Is a stored rig calibration still right? From a few image pairs of the target
+    /// Check from a few image pairs of the target whether a stored rig calibration is still valid
     Check(CalibrateCheckArgs),
 }
 
-/// Image pairs of a target, the same for every subcommand that takes them.
+/// Image pairs of a target; shared by the subcommands that read images.
 #[derive(Debug, Args)]
 pub struct PairArgs {
-    /// Images of the left camera: a glob pattern in quotes ("left*.png") or a folder; sorted by name
+    /// Images of the left camera: a quoted glob pattern ("left*.png") or a folder; sorted by name
     #[arg(long, value_name = "GLOB")]
     pub left: String,
-    /// Images of the right camera, as many, in the same order
+    /// Images of the right camera: the same number, in the same order
     #[arg(long, value_name = "GLOB")]
     pub right: String,
-    /// The target, lengths in metres: chessboard:COLSxROWS:SQUARE (inner corners),
+    /// Target, lengths in metres: chessboard:COLSxROWS:SQUARE (inner corners),
     /// charuco:COLSxROWS:SQUARE:MARKER:DICTIONARY (squares), circles:COLSxROWS:SPACING:DIAMETER
     #[arg(long, value_name = "TARGET")]
     pub target: String,
-    /// One JSON object on standard output
+    /// Print one JSON object on standard output
     #[arg(long)]
     pub json: bool,
 }
@@ -44,23 +44,23 @@ pub struct CalibrateRigArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
     pub pairs: PairArgs,
-    /// Where to write the rig
+    /// Output file for the rig
     #[arg(long, value_name = "rig.toml")]
     pub out: Option<PathBuf>,
-    /// Where to write a one-page report
+    /// Output file for a one-page HTML report
     #[arg(long, value_name = "rig.html")]
     pub report: Option<PathBuf>,
-    /// Where to write the target's points as they were found (JSON), for other tools
+    /// Output file for the detected target points (JSON)
     #[arg(long, value_name = "FILE.json")]
     pub corners: Option<PathBuf>,
-    /// Lens model: brown (k1 k2 p1 p2 k3) or rational (k4 k5 k6 as well)
+    /// Lens model: brown (k1 k2 p1 p2 k3) or rational (also k4 k5 k6)
     #[arg(long, value_name = "MODEL", default_value = "brown", value_parser = ["brown", "rational"])]
     pub lens: String,
-    /// Distance from the left camera at which the task's marks will be, NEAR,FAR in metres [default: that of the
-    /// target]
+    /// Distances of the task's marks from the left camera, NEAR,FAR in metres [default: the distances of the target in
+    /// the images]
     #[arg(long, value_name = "NEAR,FAR")]
     pub volume: Option<String>,
-    /// Error of a mark's place that the task tolerates, millimetres
+    /// Position error of a mark that the task tolerates, millimetres
     #[arg(long, value_name = "MM", default_value_t = 2.0)]
     pub tolerance_mm: f64,
 }
@@ -71,15 +71,15 @@ pub struct CalibrateCheckArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
     pub pairs: PairArgs,
-    /// The stored calibration
+    /// Stored calibration
     #[arg(long, value_name = "rig.toml")]
     pub rig: PathBuf,
 }
 
-/// Runs one of them.
+/// Runs a subcommand.
 ///
 /// # Errors
-/// Usage (2), images or files that are wrong (3), a calibration that cannot be made or no longer holds (1).
+/// Usage error (2), invalid images or files (3), a calibration that fails or is no longer valid (1).
 pub fn calibrate(command: &CalibrateCommand) -> Result<Exit, Failure> {
     match command {
         CalibrateCommand::Rig(args) => rig(args),

@@ -1,4 +1,4 @@
-//! `graspd rig`: what a rig file says.
+//! `graspd rig`: prints the contents of a rig file.
 
 use super::answer::finish;
 use crate::exit::{Exit, Failure};
@@ -6,28 +6,28 @@ use clap::{Args, Subcommand};
 use graspd_calib::calibrate::command;
 use std::path::PathBuf;
 
-/// What can be done with a rig file.
+/// Commands on a rig file.
 #[derive(Debug, Subcommand)]
 pub enum RigCommand {
-    /// Show a calibration in words: baseline, vergence, angles of view, stated errors
+    /// Print a calibration: baseline, vergence, fields of view, stated errors
     Show(RigShowArgs),
 }
 
 /// `graspd rig show`.
 #[derive(Debug, Args)]
 pub struct RigShowArgs {
-    /// The rig
+    /// Rig file
     #[arg(value_name = "rig.toml")]
     pub rig: PathBuf,
-    /// One JSON object on standard output
+    /// Print one JSON object on standard output
     #[arg(long)]
     pub json: bool,
 }
 
-/// Runs one of them.
+/// Runs a command.
 ///
 /// # Errors
-/// A file that is wrong or not what it was taken for (3).
+/// The file is invalid or is not a rig file (3).
 pub fn rig(command: &RigCommand) -> Result<Exit, Failure> {
     match command {
         RigCommand::Show(a) => finish(a.json, command::show_rig(&a.rig)),

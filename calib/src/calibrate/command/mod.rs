@@ -1,5 +1,5 @@
-//! `graspd calibrate` and `graspd rig` without the command line: options in, files and figures out, every failure in
-//! words.
+//! `graspd calibrate` and `graspd rig` without command-line parsing: each function takes the options, writes the files
+//! and returns the text, the JSON object and the kind of result.
 
 mod check;
 mod rig;
@@ -12,67 +12,67 @@ pub use show::show_rig;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
-/// How it went; the daemon's exit codes follow from it.
+/// Kind of result; determines the exit code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Answer {
     /// Done (exit code 0).
     Done,
-    /// The input is good, but there is no calibration in it, or the stored one no longer holds (exit code 1).
+    /// The input is valid, but it does not determine a calibration, or it refutes the stored one (exit code 1).
     Refused,
-    /// An option makes no sense (exit code 2).
+    /// An option is invalid (exit code 2).
     Usage,
-    /// A file or image is wrong (exit code 3).
+    /// A file or an image is invalid (exit code 3).
     Input,
 }
 
-/// What to print, and how it went.
+/// Output of a command and the kind of its result.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Outcome {
-    /// How it went.
+    /// Kind of result.
     pub answer: Answer,
-    /// For people: the figures, or what is wrong and what to do.
+    /// Text output: the figures, or the error and its remedy.
     pub text: String,
-    /// For machines.
+    /// JSON output.
     pub json: Value,
 }
 
-/// What `graspd calibrate rig` is asked.
+/// Options of `graspd calibrate rig`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RigRequest {
     /// Left images: glob pattern or folder.
     pub left: String,
     /// Right images.
     pub right: String,
-    /// Target, as typed.
+    /// Text of `--target`.
     pub target: String,
     /// Rational lens model.
     pub rational: bool,
     /// "NEAR,FAR" in metres.
     pub volume: Option<String>,
-    /// Error of a mark's place that the task tolerates, millimetres.
+    /// Position error of a mark that the task tolerates, millimetres.
     pub tolerance_mm: f64,
-    /// Where to write the rig.
+    /// Output file for the rig.
     pub out: Option<PathBuf>,
-    /// Where to write the report.
+    /// Output file for the report.
     pub report: Option<PathBuf>,
-    /// Where to write the points found.
+    /// Output file for the detected points.
     pub corners: Option<PathBuf>,
 }
 
-/// What `graspd calibrate check` is asked.
+/// Options of `graspd calibrate check`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CheckRequest {
     /// Left images: glob pattern or folder.
     pub left: String,
     /// Right images.
     pub right: String,
-    /// Target, as typed.
+    /// Text of `--target`.
     pub target: String,
     /// The stored calibration.
     pub rig: PathBuf,
 }
 
-/// A failure: how it ended, a word for machines, a sentence for people.
+/// A failure: kind of result, identifier for the JSON output, message.
 struct Failure(Answer, &'static str, String);
 
 impl From<Failure> for Outcome {

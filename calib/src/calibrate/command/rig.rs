@@ -11,8 +11,9 @@ use serde_json::{Value, json};
 use std::fmt::Write as _;
 use std::path::Path;
 
-/// Most pairs that the fit takes: beyond, nothing is gained but time; they are taken evenly over the list.
-const MOST_PAIRS: usize = 150;
+/// Maximum number of pairs in the fit. More pairs cost time and gain no accuracy. The pairs are selected evenly over
+/// the list.
+const MAX_PAIRS: usize = 150;
 
 /// Runs `graspd calibrate rig`.
 pub fn calibrate_rig(request: &RigRequest) -> Outcome {
@@ -23,18 +24,18 @@ fn work(request: &RigRequest) -> Result<Outcome, Failure> {
     let target = Target::parse(&request.target).map_err(|e| usage(e.to_string()))?;
     let range_m = request.volume.as_deref().map(range).transpose()?;
     if !(request.tolerance_mm > 0.0 && request.tolerance_mm < 1e3) {
-        return Err(usage(format!("--tolerance-mm {}: give more than 0 and less than 1000", request.tolerance_mm)));
+        return Err(usage(format!("--tolerance-mm {}: use a value above 0 and below 1000", request.tolerance_mm)));
     }
     let collected = collected(&request.left, &request.right, &target)?;
     if let Some(path) = &request.corners {
         write(path, &corners(&collected).to_string())?;
     }
-    let (pairs, unread) = thinned(collected.pairs.iter().map(pair).collect());
+    let (pairs, dropped) = selected(collected.pairs.iter().map(pair).collect());
     let lens = Lens { sizes: collected.sizes, rational: request.rational };
     let options = Options { lens, range_m, tolerance_m: request.tolerance_mm * 1e-3 };
     let found = pairs.len();
     let calibration = calibrate(&target, pairs, &options)
-        .map_err(|e| Failure(Answer::Refused, "calibration", format!("{e}{}", missing_words(&collected, found))))?;
+        .map_err(|e| Failure(Answer::Refused, "calibration", format!("{e}{}", missing_text(&collected, found))))?;
     let file = calibration.file(request.rational, None);
     if let Some(out) = &request.out {
         file.save(out).map_err(input)?;
@@ -42,21 +43,21 @@ fn work(request: &RigRequest) -> Result<Outcome, Failure> {
     if let Some(report) = &request.report {
         write(report, &crate::calibrate::report::html(&target, &collected, &calibration))?;
     }
-    let notes = notes(&collected, unread);
+    let notes = notes(&collected, dropped);
     Ok(Outcome {
         answer: Answer::Done,
-        text: words(&collected, &calibration, &notes, request.out.as_deref()),
+        text: text(&collected, &calibration, &notes, request.out.as_deref()),
         json: figures(&collected, &calibration, &notes),
     })
 }
 
-/// Finds the target in all images.
+/// Detects the target in all images.
 pub(super) fn collected(left: &str, right: &str, target: &Target) -> Result<Collected, Failure> {
-    let mut progress = Progress::new("looking for the target");
+    let mut progress = Progress::new("detecting the target");
     collect(left, right, target, |part| progress.at(part)).map_err(input)
 }
 
-/// A pair as the fit takes it.
+/// Converts a detected pair to the input of the fit.
 pub(super) fn pair(found: &FoundPair) -> Pair {
     Pair {
         name: found.name.clone(),
@@ -65,14 +66,14 @@ pub(super) fn pair(found: &FoundPair) -> Pair {
     }
 }
 
-/// No more pairs than the fit takes, evenly chosen; and how many that leaves away.
-fn thinned(pairs: Vec<Pair>) -> (Vec<Pair>, usize) {
+/// Selects at most `MAX_PAIRS` pairs evenly; also returns the number of pairs dropped.
+fn selected(pairs: Vec<Pair>) -> (Vec<Pair>, usize) {
     let n = pairs.len();
-    if n <= MOST_PAIRS {
+    if n <= MAX_PAIRS {
         return (pairs, 0);
     }
-    let keep = |k: usize| (k * MOST_PAIRS) / n != ((k + 1) * MOST_PAIRS) / n;
-    (pairs.into_iter().enumerate().filter(|(k, _)| keep(*k)).map(|(_, p)| p).collect(), n - MOST_PAIRS)
+    let keep = |k: usize| (k * MAX_PAIRS) / n != ((k + 1) * MAX_PAIRS) / n;
+    (pairs.into_iter().enumerate().filter(|(k, _)| keep(*k)).map(|(_, p)| p).collect(), n - MAX_PAIRS)
 }
 
 fn range(text: &str) -> Result<[f64; 2], Failure> {
@@ -84,10 +85,10 @@ fn range(text: &str) -> Result<[f64; 2], Failure> {
 
 fn write(path: &Path, text: &str) -> Result<(), Failure> {
     std::fs::write(path, text)
-        .map_err(|e| input(format!("{}: cannot be written: {e}; choose another place", path.display())))
+        .map_err(|e| input(format!("{}: cannot be written: {e}; choose another path", path.display())))
 }
 
-/// The points found, for other tools.
+/// The detected points as JSON.
 fn corners(c: &Collected) -> Value {
     let view = |p: &FoundPair, k: usize| -> Vec<Value> {
         p.found[k]
@@ -101,11 +102,11 @@ fn corners(c: &Collected) -> Value {
     json!({ "convention": "the centre of the top-left pixel is (0, 0)", "pairs": pairs })
 }
 
-fn missing_words(c: &Collected, found: usize) -> String {
+fn missing_text(c: &Collected, found: usize) -> String {
     if found == c.files {
         return String::new();
     }
-    let mut out = format!("\nThe target was found in {found} of {} pairs; not in", c.files);
+    let mut out = format!("\nThe target was detected in {found} of {} pairs. Pairs without the target:", c.files);
     for (_, reason) in c.missing.iter().take(5) {
         let _ = write!(out, "\n  {reason}");
     }
@@ -115,21 +116,21 @@ fn missing_words(c: &Collected, found: usize) -> String {
     out
 }
 
-fn notes(c: &Collected, unread: usize) -> Vec<String> {
+fn notes(c: &Collected, dropped: usize) -> Vec<String> {
     let mut out = Vec::new();
-    if c.turned > 0 {
+    if c.exif_rotated > 0 {
         out.push(format!(
-            "{} pairs have an image with a tag that turns it for display; the sensor's own rows and columns were used, as a live camera delivers them",
-            c.turned
+            "{} pairs contain an image with an EXIF orientation tag; the tag was ignored, and the rows and columns of the sensor were used",
+            c.exif_rotated
         ));
     }
-    if unread > 0 {
-        out.push(format!("{unread} pairs were not used: {MOST_PAIRS}, evenly chosen, are enough"));
+    if dropped > 0 {
+        out.push(format!("{dropped} pairs were not used: the fit takes at most {MAX_PAIRS} pairs, selected evenly"));
     }
     out
 }
 
-fn words(c: &Collected, k: &Calibration, notes: &[String], out: Option<&Path>) -> String {
+fn text(c: &Collected, k: &Calibration, notes: &[String], out: Option<&Path>) -> String {
     let (rig, s) = (&k.fit.state.rig, &k.holdout.scores);
     let sigma = |i: usize| k.fit.covariance[(i, i)].max(0.0).sqrt();
     let mut t = String::new();
@@ -178,7 +179,7 @@ fn words(c: &Collected, k: &Calibration, notes: &[String], out: Option<&Path>) -
     line(format!("verdict: {}", k.verdict.text));
     match out {
         Some(path) => line(format!("written: {}", path.display())),
-        None => line("nothing written: give --out rig.toml".to_owned()),
+        None => line("no file written: --out rig.toml saves the rig".to_owned()),
     }
     t.pop();
     t
@@ -197,7 +198,7 @@ fn figures(c: &Collected, k: &Calibration, notes: &[String]) -> Value {
     let t = rig.right_from_left.translation.vector * 1e3;
     let (outliers, points) = k.fit.outliers();
     json!({
-        "status": "done", "verdict": k.verdict.grade.word(), "text": k.verdict.text,
+        "status": "done", "verdict": k.verdict.grade.name(), "text": k.verdict.text,
         "pairs": { "files": c.files, "found": c.pairs.len(), "used": k.used.iter().map(|p| &p.name).collect::<Vec<_>>(),
             "rise": k.tests.iter().map(|t| t.rise).collect::<Vec<_>>(), "missing": c.missing, "left_out": k.left_out.iter().map(|l| json!({ "name": l.name, "kind": l.kind, "reason": l.reason })).collect::<Vec<_>>() },
         "left": camera(&rig.left, 0), "right": camera(&rig.right, 12), "R": rows, "T_mm": [t.x, t.y, t.z],

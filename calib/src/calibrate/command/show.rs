@@ -12,7 +12,7 @@ pub fn show_rig(path: &Path) -> Outcome {
     work(path).unwrap_or_else(Outcome::from)
 }
 
-/// Angle of view across and down, degrees, with the lens distortion.
+/// Horizontal and vertical field of view with lens distortion, degrees.
 fn view_deg(c: &Camera) -> [f64; 2] {
     let angle = |a: Pixel, b: Pixel| match (c.ray(a), c.ray(b)) {
         (Some(a), Some(b)) => a.dot(&b).clamp(-1.0, 1.0).acos().to_degrees(),
@@ -28,17 +28,17 @@ fn work(path: &Path) -> Result<Outcome, Failure> {
     let centre = rig.centre(View::Right);
     let vergence = rig.right_from_left.rotation.angle().to_degrees();
     let views = [view_deg(&rig.left), view_deg(&rig.right)];
-    let mut text = format!("{}\n", file.name.as_deref().unwrap_or("a rig without a name"));
+    let mut text = format!("{}\n", file.name.as_deref().unwrap_or("unnamed rig"));
     for (name, c, v) in [("left", &rig.left, views[0]), ("right", &rig.right, views[1])] {
         let _ = writeln!(
             text,
-            "{name:5}  {}x{} px, f {:.2}, {:.2} px, c {:.2}, {:.2} px, view {:.1} x {:.1} degrees",
+            "{name:5}  {}x{} px, f {:.2}, {:.2} px, c {:.2}, {:.2} px, field of view {:.1} x {:.1} degrees",
             c.width, c.height, c.fx, c.fy, c.cx, c.cy, v[0], v[1]
         );
     }
     let _ = writeln!(
         text,
-        "baseline {:.3} mm, the right camera at {:.2}, {:.2}, {:.2} mm of the left one's frame, vergence {vergence:.3} degrees",
+        "baseline {:.3} mm, right camera at {:.2}, {:.2}, {:.2} mm in the frame of the left camera, vergence {vergence:.3} degrees",
         centre.norm() * 1e3,
         centre.x * 1e3,
         centre.y * 1e3,
@@ -46,7 +46,7 @@ fn work(path: &Path) -> Result<Outcome, Failure> {
     );
     let _ = write!(
         text,
-        "stated error (one sigma): rotation {:.4} degrees, focal lengths {:.3} % and {:.3} % between them, principal points {:.2} px; {}",
+        "stated error (one sigma): rotation {:.4} degrees, focal lengths {:.3} % (difference between the cameras {:.3} %), principal points {:.2} px; {}",
         error.rotation_rad.to_degrees(),
         100.0 * error.focal,
         100.0 * error.focal_difference,

@@ -1,4 +1,4 @@
-//! The report's drawings, as SVG.
+//! SVG drawings of the report.
 
 use crate::calibrate::rig::Calibration;
 use crate::calibrate::rig::coverage::CELLS;
@@ -6,24 +6,24 @@ use crate::calibrate::rig::predict::{Sensitivity, Volume};
 use graspd_rt::geom::{Pixel, Vec3, View};
 use std::fmt::Write;
 
-/// Enlargement of residuals.
-const ENLARGED: f64 = 50.0;
-/// Cells of the uncertainty map, across and down.
-const MAP: (usize, usize) = (16, 12);
+/// Magnification of the drawn residuals.
+const RESIDUAL_MAGNIFICATION: f64 = 50.0;
+/// Columns and rows of the uncertainty map.
+const MAP_CELLS: (usize, usize) = (16, 12);
 
 fn frame(k: &Calibration, view: usize) -> (f64, f64) {
     let c = if view == 0 { &k.fit.state.rig.left } else { &k.fit.state.rig.right };
     (f64::from(c.width), f64::from(c.height))
 }
 
-/// Residual vectors over the image.
+/// Residual vectors at their image positions.
 pub(super) fn residuals(k: &Calibration, view: usize) -> String {
     let (w, h) = frame(k, view);
     let mut s = format!("<svg viewBox='0 0 {w} {h}'>");
     let stroke = w / 640.0;
     for (pair, all) in k.used.iter().zip(&k.fit.residuals) {
         for (seen, r) in pair.seen[view].iter().zip(&all[view]) {
-            let (a, b) = (seen.at, seen.at + r.r * (ENLARGED * stroke));
+            let (a, b) = (seen.at, seen.at + r.r * (RESIDUAL_MAGNIFICATION * stroke));
             let colour = if r.sigmas < 6.0 { "#0969da" } else { "#cf222e" };
             let _ = write!(
                 s,
@@ -35,7 +35,7 @@ pub(super) fn residuals(k: &Calibration, view: usize) -> String {
     s + "</svg>"
 }
 
-/// Points in each cell.
+/// Number of points per cell.
 pub(super) fn coverage(k: &Calibration, view: usize) -> String {
     let cells = &k.coverage.cells[view];
     let most = cells.iter().copied().max().unwrap_or(1).max(1) as f64;
@@ -43,27 +43,27 @@ pub(super) fn coverage(k: &Calibration, view: usize) -> String {
     grid(frame(k, view), CELLS, &values, |i| cells.get(i).map(|c| c.to_string()).unwrap_or_default())
 }
 
-/// Uncertainty of a mark in the middle of the volume, over the left image.
+/// Uncertainty of a mark at the middle depth of the volume, over the left image.
 pub(super) fn uncertainty(k: &Calibration) -> String {
     let rig = &k.fit.state.rig;
     let z = 0.5 * (k.volume.range_m[0] + k.volume.range_m[1]);
     let (w, h) = frame(k, 0);
-    let values: Vec<Option<f64>> = (0..MAP.0 * MAP.1)
+    let values: Vec<Option<f64>> = (0..MAP_CELLS.0 * MAP_CELLS.1)
         .map(|i| {
             let at = Pixel::new(
-                ((i % MAP.0) as f64 + 0.5) / MAP.0 as f64 * w,
-                ((i / MAP.0) as f64 + 0.5) / MAP.1 as f64 * h,
+                ((i % MAP_CELLS.0) as f64 + 0.5) / MAP_CELLS.0 as f64 * w,
+                ((i / MAP_CELLS.0) as f64 + 0.5) / MAP_CELLS.1 as f64 * h,
             );
             let n = rig.left.undistort(at)?;
             let x = Vec3::new(n.x * z, n.y * z, z);
             let q = rig.project(View::Right, &x)?;
-            let place = Volume { range_m: [z, z], places: vec![x] };
-            rig.right.contains(q, 0.0).then(|| Sensitivity::new(rig, &place).error(&k.fit.covariance).rms_m * 1e3)
+            let point = Volume { range_m: [z, z], points: vec![x] };
+            rig.right.contains(q, 0.0).then(|| Sensitivity::new(rig, &point).error(&k.fit.covariance).rms_m * 1e3)
         })
         .collect();
     let most = values.iter().flatten().copied().fold(1e-9, f64::max);
     let parts: Vec<Option<f64>> = values.iter().map(|v| v.map(|v| v / most)).collect();
-    grid((w, h), MAP, &parts, |i| values.get(i).copied().flatten().map(|v| format!("{v:.2}")).unwrap_or_default())
+    grid((w, h), MAP_CELLS, &parts, |i| values.get(i).copied().flatten().map(|v| format!("{v:.2}")).unwrap_or_default())
 }
 
 fn grid(size: (f64, f64), cells: (usize, usize), values: &[Option<f64>], label: impl Fn(usize) -> String) -> String {
@@ -86,7 +86,7 @@ fn grid(size: (f64, f64), cells: (usize, usize), values: &[Option<f64>], label: 
     s + "</svg>"
 }
 
-/// Tilts of the target, one dot a pair.
+/// Tilts of the target, one dot per pair.
 pub(super) fn tilts(k: &Calibration) -> String {
     let mut s = "<svg viewBox='-60 -45 120 90'>".to_owned();
     for r in [15, 30, 45] {

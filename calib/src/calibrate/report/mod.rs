@@ -1,10 +1,10 @@
-//! The report of a calibration as one page: verdict, figures, residuals, coverage, uncertainty over the image, each
-//! pair. One file, no network.
+//! The calibration report, one self-contained HTML page: verdict, figures, residuals, coverage, uncertainty over the
+//! image, table of pairs.
 
 mod maps;
 
 use super::rig::Calibration;
-use super::rig::score::{mean, quantile, rms};
+use super::rig::score::rms;
 use super::target::{Collected, Target};
 use std::fmt::Write;
 
@@ -17,7 +17,7 @@ th{font-weight:500;color:#57606a}.two{display:grid;grid-template-columns:1fr 1fr
 svg{width:100%;height:auto;background:#f6f8fa;border:1px solid #d0d7de}small{color:#57606a}\
 @media(max-width:50rem){.two{grid-template-columns:1fr}}";
 
-/// The page.
+/// Renders the page.
 pub fn html(target: &Target, collected: &Collected, k: &Calibration) -> String {
     let mut h = format!(
         "<!doctype html><html lang=en><meta charset=utf-8><title>Rig calibration</title><style>{STYLE}</style>"
@@ -37,24 +37,24 @@ pub fn html(target: &Target, collected: &Collected, k: &Calibration) -> String {
     }
     let _ = write!(h, "<p>{}</p>", escape(&k.next_text()));
     figures(&mut h, k);
-    h += "<h2>Residuals, 50 times enlarged</h2><div class=two>";
+    h += "<h2>Residuals, magnified 50 times</h2><div class=two>";
     for v in 0..2 {
         let _ = write!(h, "<div>{}<small>{} image</small></div>", maps::residuals(k, v), side(v));
     }
-    h += "</div><h2>Coverage: points in each part of the image</h2><div class=two>";
+    h += "</div><h2>Coverage: number of points per image cell</h2><div class=two>";
     for v in 0..2 {
         let _ = write!(h, "<div>{}<small>{} image</small></div>", maps::coverage(k, v), side(v));
     }
-    h += "</div><h2>Uncertainty of a mark by the calibration alone, and tilt of the target</h2><div class=two>";
+    h += "</div><h2>Mark error caused by the calibration alone, and tilt of the target</h2><div class=two>";
     let _ = write!(
         h,
-        "<div>{}<small>one standard deviation in space, mm, over the left image at {:.2} m; blank where the right camera does not see</small></div>",
+        "<div>{}<small>one standard deviation of the position, mm, over the left image at {:.2} m; blank outside the view of the right camera</small></div>",
         maps::uncertainty(k),
         0.5 * (k.volume.range_m[0] + k.volume.range_m[1])
     );
     let _ = write!(
         h,
-        "<div>{}<small>each dot one pair: tilt about the vertical across, about the horizontal down; rings at 15, 30, 45 degrees</small></div></div>",
+        "<div>{}<small>one dot per pair: tilt about the vertical axis to the right, about the horizontal axis down; rings at 15, 30, 45 degrees</small></div></div>",
         maps::tilts(k)
     );
     pairs(&mut h, collected, k);
@@ -106,17 +106,17 @@ fn figures(h: &mut String, k: &Calibration) {
     row(
         "mark error",
         format!(
-            "{:.3} mm by the covariance, {:.3} mm by leaving groups out (one standard deviation); {:.3} px from the epipolar line",
+            "{:.3} mm from the covariance, {:.3} mm from the jackknife (one standard deviation); {:.3} px from the epipolar line",
             k.predicted.rms_m * 1e3,
             k.jackknife_m * 1e3,
             k.predicted.epipolar_px
         ),
     );
-    let (wild, all) = k.fit.outliers();
+    let (outliers, all) = k.fit.outliers();
     row(
         "points",
         format!(
-            "{all}, of which {wild} held off as gross errors; the board is bent by {:.3} &plusmn; {:.3} mm",
+            "{all}, of which {outliers} rejected as gross errors; bending of the board {:.3} &plusmn; {:.3} mm",
             k.bending_m[0] * 1e3,
             k.bending_m[1] * 1e3
         ),

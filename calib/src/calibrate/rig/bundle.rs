@@ -1,10 +1,11 @@
-//! The joint fit: all target points of all pairs in both views, weighted by their covariances, robust, with the
-//! covariance of what comes out.
+//! The joint robust fit of all target points of all pairs in both views, weighted by their covariances, and the
+//! covariance of the estimate.
 //!
-//! A point's residual has the covariance s² (C + t² I): C is what the detector says, t what it cannot know (print,
-//! paper, compression), s a common factor; s and t are estimated. Gross errors are held off by Tukey's biweight, which
-//! is a maximum-likelihood weight of nearly 1 for all that is noise and 0 for what is not; nothing else is thrown away
-//! here. Poses are eliminated (Schur), so that the work grows with the number of pairs only linearly.
+//! The residual of a point has the covariance s² (C + t² I). C is the covariance from the detector, t is the part that
+//! the detector cannot determine (print, paper, compression), and s is a common factor. The fit estimates s and t.
+//! Tukey's biweight (an M-estimator) rejects gross errors: its weight is nearly 1 for residuals within the noise and 0
+//! beyond its end. The fit rejects nothing else. The poses are eliminated (Schur complement), so that the cost grows
+//! linearly with the number of pairs.
 
 use super::Pair;
 use super::parameters::{BEND, BENDING, SHARED, SharedStep, State, project, renormalised};
@@ -12,26 +13,26 @@ use crate::calibrate::target::{Seen, Target};
 use graspd_rt::geom::{Pose, exp_twist};
 use nalgebra::{Matrix2, Matrix6, SMatrix, Vector2, Vector6};
 
-/// End of the biweight, standard deviations: a normal residual is beyond it once in 65 million points.
+/// End of the biweight, standard deviations. One normal residual in 65 million points is beyond it.
 pub const BIWEIGHT_END: f64 = 6.0;
-/// One standard deviation of how far a board is bent, as a part of its diagonal: a clamped sheet of glass has less,
+/// Standard deviation of the bending of a board, as a fraction of its diagonal. A clamped sheet of glass has less,
 /// cardboard more.
-const BEND_PART: f64 = 1e-3;
-/// Rounds of noise and fit; each is a handful of steps.
-const ROUNDS: usize = 12;
-/// Steps of a round.
-const STEPS: usize = 15;
+const BEND_SIGMA_FRACTION: f64 = 1e-3;
+/// Maximum number of rounds. Each round estimates the noise and then takes a few steps of the fit.
+const MAX_ROUNDS: usize = 12;
+/// Maximum number of steps per round.
+const MAX_STEPS: usize = 15;
 
 /// Reduced normal matrix of the shared parameters.
 pub type Shared = SMatrix<f64, SHARED, SHARED>;
 type Mixed = SMatrix<f64, SHARED, 6>;
 
-/// The noise of target points: s² (C + t² I).
+/// Noise model of the target points: covariance s² (C + t² I).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Noise {
-    /// Factor s.
+    /// Common factor s.
     pub scale: f64,
-    /// What the detector does not know, t, pixels.
+    /// Floor t, the part that the detector cannot determine, pixels.
     pub floor_px: f64,
 }
 
@@ -43,28 +44,28 @@ impl Noise {
     }
 }
 
-/// A residual, observed less predicted.
+/// A residual: observed minus predicted position.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Residual {
-    /// Which point of the target.
+    /// Index of the target point.
     pub index: usize,
-    /// Pixels.
+    /// The residual, pixels.
     pub r: Vector2<f64>,
-    /// Its length in standard deviations.
+    /// Its Mahalanobis length, standard deviations.
     pub sigmas: f64,
 }
 
-/// What is fitted.
+/// Inputs of a fit.
 pub struct Problem<'a> {
     /// The target.
     pub target: &'a Target,
     /// The pairs.
     pub pairs: &'a [Pair],
-    /// Which shared parameters are estimated; the others keep their values.
+    /// Whether each shared parameter is estimated; the others keep their values.
     pub free: [bool; SHARED],
 }
 
-/// What comes out.
+/// Result of a fit.
 #[derive(Clone, Debug)]
 pub struct Fit {
     /// The estimate.
@@ -80,26 +81,26 @@ pub struct Fit {
 }
 
 impl Fit {
-    /// Root mean square residual of what is not a gross error, pixels, over u and v together as OpenCV counts it.
+    /// Root mean square length of the residuals without gross errors, pixels; u and v are combined as in OpenCV.
     pub fn rms_px(&self) -> f64 {
         let all = || self.residuals.iter().flatten().flatten().filter(|r| r.sigmas < BIWEIGHT_END);
         (all().map(|r| r.r.norm_squared()).sum::<f64>() / all().count().max(1) as f64).sqrt()
     }
 
-    /// Points that were held off as gross errors, of all.
+    /// Number of points rejected as gross errors, and number of all points.
     pub fn outliers(&self) -> (usize, usize) {
         let all = || self.residuals.iter().flatten().flatten();
         (all().filter(|r| r.sigmas >= BIWEIGHT_END).count(), all().count())
     }
 }
 
-/// Weight of the biweight at a distance in sigmas.
+/// Weight of the biweight at a length in standard deviations.
 fn biweight(sigmas: f64) -> f64 {
     let t = 1.0 - (sigmas / BIWEIGHT_END).powi(2);
     if t > 0.0 { t * t } else { 0.0 }
 }
 
-/// Its cost, half a squared distance near zero.
+/// Cost of the biweight; half the squared length near zero.
 fn biweight_cost(sigmas: f64) -> f64 {
     let t = (1.0 - (sigmas / BIWEIGHT_END).powi(2)).max(0.0);
     BIWEIGHT_END * BIWEIGHT_END / 6.0 * (1.0 - t * t * t)
@@ -119,7 +120,7 @@ struct Normal {
     pairs: Vec<PairNormal>,
 }
 
-/// Adds one pair's points; `None` where a point falls behind a camera.
+/// Adds the points of one pair; `None` if a point is behind a camera.
 fn add_pair(
     n: &mut Normal,
     problem: &Problem<'_>,
@@ -155,7 +156,7 @@ fn linearise(problem: &Problem<'_>, state: &State, noise: &Noise) -> Option<Norm
         let p = add_pair(&mut n, problem, state, noise, pair, pose)?;
         n.pairs.push(p);
     }
-    let sigma = BEND_PART * problem.target.size().norm();
+    let sigma = BEND_SIGMA_FRACTION * problem.target.size().norm();
     for k in 0..BEND {
         let (at, value) = (BENDING + k, state.bend[k]);
         n.cost += 0.5 * (value / sigma).powi(2);
@@ -176,7 +177,8 @@ fn linearise(problem: &Problem<'_>, state: &State, noise: &Noise) -> Option<Norm
     Some(n)
 }
 
-/// The shared normal matrix and gradient with the poses eliminated, and what gives the poses back.
+/// The shared normal matrix and gradient with the poses eliminated, and the inverse pose matrices for
+/// back-substitution.
 fn reduce(n: &Normal, damping: f64) -> Option<(Shared, SharedStep, Vec<Matrix6<f64>>)> {
     let mut shared = n.shared;
     for k in 0..SHARED {
@@ -187,7 +189,7 @@ fn reduce(n: &Normal, damping: f64) -> Option<(Shared, SharedStep, Vec<Matrix6<f
     for p in &n.pairs {
         let mut a = p.pose;
         for k in 0..6 {
-            // A view without any point left has no information about its pose; it stays where it is.
+            // A view without points has no information about its pose; keep the pose unchanged.
             a[(k, k)] = a[(k, k)] * (1.0 + damping) + 1e-9;
         }
         let inverse = a.cholesky()?.inverse();
@@ -199,7 +201,7 @@ fn reduce(n: &Normal, damping: f64) -> Option<(Shared, SharedStep, Vec<Matrix6<f
     Some((shared, gradient, inverses))
 }
 
-/// Solves with each parameter in its own unit, so that a focal length and a k3 do not ruin the conditioning.
+/// Solves with each parameter scaled by its own curvature, since focal lengths and k3 differ by orders of magnitude.
 fn solve_scaled(a: &Shared, b: &SharedStep) -> Option<SharedStep> {
     let scale = SharedStep::from_fn(|k, _| 1.0 / a[(k, k)].max(1e-300).sqrt());
     let scaled = Shared::from_fn(|i, j| a[(i, j)] * scale[i] * scale[j]);
@@ -216,7 +218,7 @@ fn stepped(state: &State, n: &Normal, d: &SharedStep, inverses: &[Matrix6<f64>])
     next
 }
 
-/// Minimises at a fixed noise; the state and whether its last step was negligible.
+/// Minimises with fixed noise; returns the state and whether its last step was negligible.
 fn minimise(problem: &Problem<'_>, mut state: State, noise: &Noise, steps: usize) -> Option<(State, bool)> {
     let mut at = linearise(problem, &state, noise)?;
     let mut damping = 1e-4;
@@ -264,14 +266,14 @@ pub fn residuals(target: &Target, pairs: &[Pair], state: &State, noise: &Noise) 
         .collect()
 }
 
-/// A robust first scale: the median length of two-dimensional normal residuals is 1.177 standard deviations.
+/// Robust initial scale: the median length of two-dimensional normal residuals is 1.177 standard deviations.
 fn median_scale(all: &[[Vec<Residual>; 2]]) -> f64 {
     let mut lengths: Vec<f64> = all.iter().flatten().flatten().map(|r| r.sigmas).collect();
     lengths.sort_by(f64::total_cmp);
     lengths.get(lengths.len() / 2).copied().unwrap_or(1.0) / 1.177
 }
 
-/// The noise under which the residuals that are no gross errors are likeliest.
+/// Maximum-likelihood noise for the residuals that are not gross errors.
 fn likeliest_noise(problem: &Problem<'_>, all: &[[Vec<Residual>; 2]], parameters: usize) -> Noise {
     let seen = problem.pairs.iter().flat_map(|p| p.seen.iter().flatten());
     let good: Vec<(&Seen, Vector2<f64>)> = seen
@@ -296,24 +298,24 @@ fn likeliest_noise(problem: &Problem<'_>, all: &[[Vec<Residual>; 2]], parameters
     floors.map(of).min_by(|a, b| a.0.total_cmp(&b.0)).map_or(Noise { scale: 1.0, floor_px: 0.1 }, |(_, n)| n)
 }
 
-/// Fits; `None` where it cannot even start (a point behind a camera).
+/// Fits; `None` if the start is invalid (a point behind a camera) or a matrix is singular.
 pub fn fit(problem: &Problem<'_>, start: State) -> Option<Fit> {
     let mut noise = Noise { scale: 1.0, floor_px: 0.1 };
     let mut state = start;
     let parameters = problem.free.iter().filter(|f| **f).count() + 6 * problem.pairs.len();
     let mut converged = false;
     let mut all = residuals(problem.target, problem.pairs, &state, &noise)?;
-    for round in 0..ROUNDS {
+    for round in 0..MAX_ROUNDS {
         let before = noise;
         let rough = median_scale(&all) * noise.scale;
-        // Far from the minimum residuals are no noise: their median sets the scale until most of them are within reach
-        // of it.
+        // Far from the minimum the residuals are not noise: use their median as scale until most of them are within the
+        // range of the biweight.
         noise = if round < 3 {
             Noise { scale: rough.max(1e-6), ..noise }
         } else {
             likeliest_noise(problem, &all, parameters)
         };
-        (state, converged) = minimise(problem, state, &noise, STEPS)?;
+        (state, converged) = minimise(problem, state, &noise, MAX_STEPS)?;
         all = residuals(problem.target, problem.pairs, &state, &noise)?;
         let same = (noise.scale / before.scale - 1.0).abs() < 1e-3 && (noise.floor_px - before.floor_px).abs() < 1e-9;
         if round > 3 && same && converged {
@@ -327,7 +329,7 @@ pub fn fit(problem: &Problem<'_>, start: State) -> Option<Fit> {
 }
 
 /// Factor from the inverse of the weighted normal matrix to the covariance of the robust estimate (Huber 1981):
-/// E w E psi^2 / (E psi')^2, with the residuals' own loss of freedom given back.
+/// E w E psi^2 / (E psi')^2, corrected for the degrees of freedom that the parameters consume.
 fn biweight_variance(all: &[[Vec<Residual>; 2]], parameters: usize) -> f64 {
     let (mut w, mut square, mut slope, mut count) = (0.0, 0.0, 0.0, 1e-9);
     for r in all.iter().flatten().flatten() {
@@ -343,7 +345,7 @@ fn biweight_variance(all: &[[Vec<Residual>; 2]], parameters: usize) -> f64 {
     if factor.is_finite() { factor } else { 1.0 }
 }
 
-/// Inverse of an information matrix over the free parameters; zero elsewhere.
+/// Inverse of an information matrix; rows and columns of fixed parameters are zero.
 pub fn covariance(information: &Shared, free: &[bool; SHARED]) -> Option<Shared> {
     let scale = SharedStep::from_fn(|k, _| 1.0 / information[(k, k)].max(1e-300).sqrt());
     let scaled = Shared::from_fn(|i, j| information[(i, j)] * scale[i] * scale[j]);
@@ -351,8 +353,8 @@ pub fn covariance(information: &Shared, free: &[bool; SHARED]) -> Option<Shared>
     Some(Shared::from_fn(|i, j| if free[i] && free[j] { inverse[(i, j)] * scale[i] * scale[j] } else { 0.0 }))
 }
 
-/// What a pair adds to the information about the shared parameters, its pose unknown, points as seen (weights without
-/// outliers).
+/// Information of a pair about the shared parameters with its pose eliminated. The points of the pair define the
+/// weights; none should be an outlier.
 pub fn pair_information(
     problem: &Problem<'_>,
     state: &State,
@@ -373,26 +375,26 @@ pub fn pair_information(
     Some(out)
 }
 
-/// A board's pose from the points of one or both views of a pair, the calibration held.
+/// Pose of a board from the points of one or both views of a pair, with fixed calibration.
 #[derive(Clone, Debug)]
 pub struct PoseFit {
-    /// Where the board is in the left frame.
+    /// Pose of the board in the left frame.
     pub pose: Pose,
-    /// Twice the robust cost: chi squared where nothing is a gross error.
+    /// Twice the robust cost: chi squared if there are no gross errors.
     pub chi2: f64,
     /// Inverse covariance of the pose's twist.
     pub information: Matrix6<f64>,
 }
 
-/// Scales of the noise under which a pose is fitted, one after the other: a start that is a pixel off lies beyond the
-/// biweight's end.
-const WIDENED: [f64; 3] = [30.0, 5.0, 1.0];
+/// Factors on the noise scale in the successive fits of a pose. A start with an error of a pixel is beyond the end of
+/// the unscaled biweight.
+const POSE_NOISE_FACTORS: [f64; 3] = [30.0, 5.0, 1.0];
 
-/// Fits a pose with the calibration held; a view that is not to be used is left empty in `pair`.
+/// Fits a pose with fixed calibration. A view of `pair` without points is not used.
 pub fn fit_pose(target: &Target, state: &State, noise: &Noise, pair: &Pair, start: &Pose) -> Option<PoseFit> {
     let mut out = None;
     let mut pose = *start;
-    for by in WIDENED {
+    for by in POSE_NOISE_FACTORS {
         let fit = fit_pose_at(target, state, &Noise { scale: noise.scale * by, ..*noise }, pair, &pose)?;
         pose = fit.pose;
         out = Some(fit);
@@ -400,7 +402,7 @@ pub fn fit_pose(target: &Target, state: &State, noise: &Noise, pair: &Pair, star
     out
 }
 
-/// Fits at one scale.
+/// Fits with one noise scale.
 fn fit_pose_at(target: &Target, state: &State, noise: &Noise, pair: &Pair, start: &Pose) -> Option<PoseFit> {
     let problem = Problem { target, pairs: &[], free: [false; SHARED] };
     let at = |pose: &Pose| {

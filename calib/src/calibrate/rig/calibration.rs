@@ -1,5 +1,5 @@
-//! Everything about a set of pairs: the rig, its covariance, what the held-out pairs say, what it means, and what to do
-//! next.
+//! The entire calibration of a rig: fit, hold-out, predicted mark error, verdict, recommended next pair, and the rig
+//! file.
 
 use super::bundle::Fit;
 use super::coverage::Coverage;
@@ -16,47 +16,47 @@ use crate::files::{Quality, RigCovariance, RigFile};
 use graspd_rt::geom::View;
 use nalgebra::{DMatrix, Matrix2};
 
-/// What is asked.
+/// Options of a calibration.
 #[derive(Clone, Copy, Debug)]
 pub struct Options {
-    /// Sizes and lens model.
+    /// Image sizes and lens model.
     pub lens: Lens,
-    /// Distances at which the task's marks will be, metres; where the target was if not given.
+    /// Range of distances of the task's marks, metres; `None` for that of the target in the images.
     pub range_m: Option<[f64; 2]>,
-    /// What the task tolerates, metres.
+    /// Position error of a mark that the task tolerates, metres.
     pub tolerance_m: f64,
 }
 
-/// A calibrated rig and all that is known about it.
+/// A calibrated rig with its assessment.
 #[derive(Clone, Debug)]
 pub struct Calibration {
     /// The fit to the pairs used.
     pub fit: Fit,
-    /// Those pairs.
+    /// The pairs used.
     pub used: Vec<Pair>,
-    /// Their tests.
+    /// Tests of the pairs used.
     pub tests: Vec<Test>,
-    /// The others.
+    /// The excluded pairs.
     pub left_out: Vec<LeftOut>,
-    /// What held-out pairs say.
+    /// Hold-out results.
     pub holdout: Holdout,
-    /// What the images cover.
+    /// Coverage of the images.
     pub coverage: Coverage,
     /// The volume for which errors are predicted.
     pub volume: Volume,
-    /// Predicted error of a mark.
+    /// Mark error from the covariance.
     pub predicted: MarkError,
-    /// The same from leaving groups out, one standard deviation, metres.
+    /// Mark error from the jackknife over groups, one standard deviation, metres.
     pub jackknife_m: f64,
-    /// The pair to take next.
+    /// Recommended additional pair.
     pub next: Option<Advice>,
-    /// In words.
+    /// The verdict.
     pub verdict: Verdict,
-    /// How far the board is bent and one standard deviation of it, metres.
+    /// Bending of the board and its standard deviation, metres.
     pub bending_m: [f64; 2],
 }
 
-/// Calibrates.
+/// Calibrates the rig.
 ///
 /// # Errors
 /// See [`CalibrateError`].
@@ -70,7 +70,7 @@ pub fn calibrate(target: &Target, pairs: Vec<Pair>, options: &Options) -> Result
     let (state, cov) = (&solved.fit.state, &solved.fit.covariance);
     let coverage = Coverage::of(&solved.used, state);
     let volume = Volume::new(&state.rig, options.range_m.unwrap_or_else(|| coverage.usual_range_m()));
-    if volume.places.is_empty() {
+    if volume.points.is_empty() {
         return Err(CalibrateError::NoVolume { range_m: volume.range_m });
     }
     let predicted = Sensitivity::new(&state.rig, &volume).error(cov);
@@ -108,7 +108,7 @@ pub fn calibrate(target: &Target, pairs: Vec<Pair>, options: &Options) -> Result
     })
 }
 
-/// The median covariance of the points: what an image like the others would have.
+/// Isotropic covariance with the median variance of the points, for simulated images.
 fn typical(pairs: &[Pair]) -> Matrix2<f64> {
     let v =
         super::pairs::median(pairs.iter().flat_map(|p| p.seen.iter().flatten()).map(|s| 0.5 * s.covariance.trace()));
@@ -116,16 +116,16 @@ fn typical(pairs: &[Pair]) -> Matrix2<f64> {
 }
 
 impl Calibration {
-    /// Which image to take next, or that none is needed, as a sentence.
+    /// Message with the recommended additional pair, or that no pair is needed.
     pub fn next_text(&self) -> String {
         match &self.next {
             Some(n) if self.verdict.more_helps => format!(
-                "next: the target {}; that lowers the marks' error by {:.0} %",
+                "next: place the target {}; this pair reduces the mark error by {:.0} %",
                 n.text,
                 100.0 * (1.0 - n.factor).max(0.0)
             ),
             Some(_) | None => {
-                "next: no further image is needed; one more lowers the marks' error by less than 3 %".to_owned()
+                "next: no pair is needed; another pair reduces the mark error by less than 3 %".to_owned()
             }
         }
     }
@@ -145,7 +145,7 @@ impl Calibration {
         }
     }
 
-    /// The figures of `[quality]`; the rig's own error from the covariance.
+    /// The values of `[quality]`; the error of the rig is from the covariance.
     fn quality(&self) -> Quality {
         let (cov, state) = (&self.fit.covariance, &self.fit.state);
         let variance = |k: usize| cov[(k, k)].max(0.0);
@@ -165,7 +165,7 @@ impl Calibration {
         }
     }
 
-    /// The state without poses, for projections.
+    /// The state without poses of the board, for projections.
     pub fn bare_state(&self) -> State {
         State { left_from_board: Vec::new(), ..self.fit.state.clone() }
     }

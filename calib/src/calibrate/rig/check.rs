@@ -1,9 +1,9 @@
-//! Is a stored calibration still right? A few pairs of the target, the stored rig, and the motion of the right camera
-//! that would explain them better, against what the stored covariance and the points' noise allow.
+//! Check of a stored calibration: estimates from a few pairs the motion of the right camera relative to the stored rig,
+//! and compares it with the stored covariance and the noise of the points.
 
 use super::bundle::{Problem, fit};
 use super::initial::pose_from_view;
-use super::pairs::{Judge, LeftOut, test, usual_alone, usual_rise};
+use super::pairs::{LeftOut, PairCriteria, test, usual_alone, usual_rise};
 use super::parameters::{BEND, SHARED, State, TWIST};
 use super::score::{Scores, score};
 use super::solve::align;
@@ -13,49 +13,51 @@ use crate::files::RigFile;
 use graspd_rt::geom::{Rig, log_pose};
 use nalgebra::{Matrix6, Vector6};
 
-/// Chi squared with six degrees of freedom that one calibration in a thousand exceeds which still holds.
-const CHANGED: f64 = 22.46;
-/// Epipolar distance up to which a significant change does not matter: what a good rig leaves anyway, pixels.
-const HARMLESS_PX: f64 = 0.2;
+/// Maximum chi squared with six degrees of freedom of an unchanged calibration. One valid calibration in a thousand
+/// exceeds it.
+const MAX_CHI2: f64 = 22.46;
+/// Maximum epipolar distance at which a significant change is acceptable, pixels. A good rig has residuals of this
+/// size.
+const MAX_HARMLESS_PX: f64 = 0.2;
 
-/// What the check says.
+/// Result of the check.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Standing {
-    /// It holds.
+pub enum CheckState {
+    /// No significant change.
     Holds,
-    /// It has changed, by less than matters.
+    /// A significant change that is still acceptable.
     Drifted,
-    /// It is no longer right.
+    /// A significant change that is not acceptable.
     Changed,
-    /// It is off by more than matters, but by no more than its file says that it may be.
+    /// An error that is not acceptable, but within the uncertainty that the file states.
     Coarse,
 }
 
-/// What came out.
+/// Verdict and figures of the check.
 #[derive(Clone, Debug)]
 pub struct Check {
     /// The verdict.
-    pub state: Standing,
+    pub state: CheckState,
     /// Scores with the stored rig.
     pub before: Scores,
-    /// Scores with the right camera moved to where the images put it.
+    /// Scores with the estimated motion of the right camera applied.
     pub after: Scores,
-    /// That motion, in the right camera's frame: metres, radians.
+    /// The estimated motion in the right camera's frame: metres, radians.
     pub motion: Vector6<f64>,
-    /// Its squared length in its covariance; six degrees of freedom.
+    /// Squared Mahalanobis length of the motion; six degrees of freedom.
     pub chi2: f64,
-    /// Pairs used, and left out.
+    /// Number of pairs used.
     pub used: usize,
-    /// The others.
+    /// The excluded pairs.
     pub left_out: Vec<LeftOut>,
-    /// The rig with that motion.
+    /// The stored rig with the motion applied.
     pub rig: Rig,
 }
 
 /// Checks a stored rig.
 ///
 /// # Errors
-/// No pair that can be used.
+/// No pair can be used.
 pub fn check(target: &Target, mut pairs: Vec<Pair>, stored: &RigFile) -> Result<Check, CalibrateError> {
     align(target, &mut pairs);
     let mut free = [false; SHARED];
@@ -71,15 +73,15 @@ pub fn check(target: &Target, mut pairs: Vec<Pair>, stored: &RigFile) -> Result<
         let tests: Vec<_> = pairs.iter().map(|p| test(target, &at, &fitted.noise, p)).collect();
         let known: Vec<_> = tests.iter().flatten().cloned().collect();
         let (usual, alone) = (usual_rise(&known), usual_alone(&known));
-        let judge = Judge { target, state: &at, noise: fitted.noise, usual, usual_alone: alone };
+        let criteria = PairCriteria { target, state: &at, noise: fitted.noise, usual, usual_alone: alone };
         let worst = (0..pairs.len())
-            .filter(|k| !tests[*k].as_ref().is_some_and(|t| judge.good(t)))
+            .filter(|k| !tests[*k].as_ref().is_some_and(|t| criteria.consistent(t)))
             .max_by(|a, b| rise(&tests[*a]).total_cmp(&rise(&tests[*b])));
-        // Of two pairs that disagree nobody knows which one is wrong.
+        // If only two pairs are left and they disagree, the wrong one cannot be identified.
         if let Some(k) = worst
             && pairs.len() > 2
         {
-            left_out.push(judge.reason(&pairs[k], tests[k].as_ref(), &pairs));
+            left_out.push(criteria.reason(&pairs[k], tests[k].as_ref(), &pairs));
             pairs.remove(k);
             continue;
         }
@@ -91,7 +93,7 @@ fn rise(t: &Option<super::pairs::Test>) -> f64 {
     t.as_ref().map_or(f64::MAX, |t| t.rise)
 }
 
-/// The stored rig with the boards where the left images put them.
+/// The stored rig with the poses of the boards from the left images.
 fn poses(target: &Target, pairs: &mut Vec<Pair>, rig: &Rig, left_out: &mut Vec<LeftOut>) -> State {
     let mut left_from_board = Vec::new();
     pairs.retain(|p| {
@@ -101,7 +103,7 @@ fn poses(target: &Target, pairs: &mut Vec<Pair>, rig: &Rig, left_out: &mut Vec<L
             None => left_out.push(LeftOut {
                 name: p.name.clone(),
                 kind: "not-a-board",
-                reason: "no pose of the board explains its left image with the stored lens".to_owned(),
+                reason: "no pose of the board explains the left image with the stored lens".to_owned(),
             }),
         }
         pose.is_some()
@@ -129,18 +131,18 @@ fn answer(
     let chi2 = both.try_inverse().map_or(0.0, |i| motion.dot(&(i * motion)));
     let rms = super::score::rms(&before.epipolar_px);
     let seen = own.try_inverse().map_or(0.0, |i| motion.dot(&(i * motion)));
-    let state = match (chi2 < CHANGED, rms < HARMLESS_PX) {
-        (true, true) => Standing::Holds,
-        (false, true) => Standing::Drifted,
-        (false, false) => Standing::Changed,
-        (true, false) if seen < CHANGED => Standing::Holds,
-        (true, false) => Standing::Coarse,
+    let state = match (chi2 < MAX_CHI2, rms < MAX_HARMLESS_PX) {
+        (true, true) => CheckState::Holds,
+        (false, true) => CheckState::Drifted,
+        (false, false) => CheckState::Changed,
+        (true, false) if seen < MAX_CHI2 => CheckState::Holds,
+        (true, false) => CheckState::Coarse,
     };
     Check { state, before, after, motion, chi2, used: pairs.len(), left_out, rig: *rig }
 }
 
-/// Covariance of the stored relative pose: the file's own, or what its quality states, a turn at the baseline's length
-/// for the place.
+/// Covariance of the stored relative pose: that of the file, or else derived from its `[quality]`, with the rotation
+/// error times the baseline as translation error.
 fn stored_covariance(file: &RigFile) -> Matrix6<f64> {
     let names = ["x", "y", "z", "rx", "ry", "rz"].map(|n| format!("right_from_left.{n}"));
     if let Some(c) = &file.covariance {
@@ -150,9 +152,11 @@ fn stored_covariance(file: &RigFile) -> Matrix6<f64> {
             return Matrix6::from_fn(|i, j| m[(rows[i], rows[j])]);
         }
     }
-    let turn = file.error().rotation_rad;
-    let place = turn * file.rig.right_from_left.translation.vector.norm();
-    Matrix6::from_diagonal(&Vector6::new(place, place, place, turn, turn, turn).map(|s| s * s))
+    let rotation = file.error().rotation_rad;
+    let translation = rotation * file.rig.right_from_left.translation.vector.norm();
+    Matrix6::from_diagonal(
+        &Vector6::new(translation, translation, translation, rotation, rotation, rotation).map(|s| s * s),
+    )
 }
 
 #[cfg(test)]
@@ -163,24 +167,24 @@ mod tests {
     use rand::SeedableRng;
 
     #[test]
-    fn a_rig_that_stands_holds_and_one_that_was_bent_does_not() {
+    fn an_unchanged_rig_holds_and_a_displaced_camera_is_detected() {
         let (rig, target) = truth();
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(21);
         let pairs = set(&mut rng, &rig, &target, 4);
         let c = check(&target, pairs.clone(), &RigFile::new(rig)).unwrap();
-        assert_eq!((c.state, c.used), (Standing::Holds, 4));
-        // A third of a degree: a knock.
-        let bent = exp_twist(&Vector6::new(0.0, 0.0, 0.0, 0.006, 0.0, 0.0)) * rig.right_from_left;
-        let off = RigFile::new(Rig { right_from_left: bent, ..rig });
-        // A file that states nothing may be off by 0.1 degrees about each axis: nobody knows whether it was ever
-        // better.
-        assert_eq!(check(&target, pairs.clone(), &off).unwrap().state, Standing::Coarse);
+        assert_eq!((c.state, c.used), (CheckState::Holds, 4));
+        // The right camera is displaced by a third of a degree.
+        let displaced = exp_twist(&Vector6::new(0.0, 0.0, 0.0, 0.006, 0.0, 0.0)) * rig.right_from_left;
+        let off = RigFile::new(Rig { right_from_left: displaced, ..rig });
+        // A file without a stated error has a default uncertainty of 0.1 degrees about each axis, so that the change is
+        // not significant.
+        assert_eq!(check(&target, pairs.clone(), &off).unwrap().state, CheckState::Coarse);
         let names = ["x", "y", "z", "rx", "ry", "rz"].map(|n| format!("right_from_left.{n}"));
         let names: Vec<&str> = names.iter().map(String::as_str).collect();
         let small = nalgebra::DMatrix::from_diagonal_element(6, 6, 1e-7);
         let stated = RigFile { covariance: Some(crate::files::RigCovariance::of(&names, &small)), ..off };
         let c = check(&target, pairs, &stated).unwrap();
-        assert_eq!(c.state, Standing::Changed);
+        assert_eq!(c.state, CheckState::Changed);
         let found = c.motion.fixed_rows::<3>(3).into_owned();
         assert!((found - nalgebra::Vector3::new(-0.006, 0.0, 0.0)).norm() < 5e-4, "{found}");
         assert!(super::super::score::rms(&c.after.epipolar_px) < 0.2);

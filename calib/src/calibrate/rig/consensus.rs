@@ -1,29 +1,30 @@
-//! A first relative pose: the one that most pairs agree with.
+//! Initial relative pose of the cameras by consensus of the pairs.
 
 use super::Pair;
 use super::pairs::median;
 use crate::calibrate::target::Target;
 use graspd_rt::geom::{Camera, Pose};
 
-/// Pairs whose relative pose puts the points of the right image this many times farther than the median pair does are
-/// not used for the first joint fit; they are tested again after it.
-const FAR: f64 = 4.0;
-/// A disagreement below this is never far, pixels: the two single-camera fits alone differ by that much.
-const NEAR_PX: f64 = 2.0;
-/// Where even the median pair disagrees with the best one by more than this, there is no common rig, pixels.
-pub(super) const NO_RIG_PX: f64 = 25.0;
+/// Maximum disagreement of a pair in the first joint fit, as a multiple of the median disagreement. The pairs beyond it
+/// are tested again after that fit.
+const MAX_DISAGREEMENT_RATIO: f64 = 4.0;
+/// Lower bound of the limit on the disagreement, pixels: the two single-camera fits alone differ by this much.
+const MIN_LIMIT_PX: f64 = 2.0;
+/// Maximum median disagreement with the best pair, pixels. Above it the pairs have no common rig.
+pub(super) const MAX_MEDIAN_DISAGREEMENT_PX: f64 = 25.0;
 
-/// What the pairs agree on.
+/// Result of the consensus.
 pub(super) struct Consensus {
-    /// Right camera against left.
+    /// Relative pose of the cameras.
     pub(super) right_from_left: Pose,
-    /// Which pairs agree.
+    /// Whether each pair agrees.
     pub(super) agree: Vec<bool>,
-    /// How far the median pair disagrees, pixels.
+    /// Median disagreement, pixels.
     pub(super) median_px: f64,
 }
 
-/// The relative pose of the pair with which the others agree best. Poses are of the boards in each camera.
+/// Selects the pair whose relative pose has the lowest median disagreement with the others. `left_poses` and
+/// `right_poses` are the poses of the boards in the frame of each camera.
 pub(super) fn consensus(
     target: &Target,
     right: &Camera,
@@ -38,7 +39,7 @@ pub(super) fn consensus(
             let p = target.point(s.index);
             let x = predicted * nalgebra::Point3::new(p.x, p.y, 0.0);
             let y = right_poses[i] * nalgebra::Point3::new(p.x, p.y, 0.0);
-            // The pinhole alone: far from the consensus a distorted prediction may fold.
+            // Pinhole projection only: far from the consensus the distortion model may not be one-to-one.
             let pixel = |x: &nalgebra::Point3<f64>| {
                 (x.z > 1e-6).then(|| nalgebra::Vector2::new(x.x / x.z * right.fx, x.y / x.z * right.fy))
             };
@@ -50,7 +51,7 @@ pub(super) fn consensus(
     let of = |k: usize| median((0..pairs.len()).map(|i| distance(i, &relative[k])));
     let best = (0..pairs.len()).min_by(|a, b| of(*a).total_cmp(&of(*b)))?;
     let median_px = of(best);
-    let limit = (FAR * median_px).max(NEAR_PX);
+    let limit = (MAX_DISAGREEMENT_RATIO * median_px).max(MIN_LIMIT_PX);
     let agree = (0..pairs.len()).map(|i| distance(i, &relative[best]) <= limit).collect();
     Some(Consensus { right_from_left: relative[best], agree, median_px })
 }

@@ -1,18 +1,18 @@
-//! Where in the images the target was, and how it was tilted.
+//! Coverage: positions of the target in the images, and its tilts.
 
 use super::Pair;
 use super::parameters::State;
 use graspd_rt::geom::Vec3;
 
-/// Cells of an image, across and down.
+/// Columns and rows of cells of an image.
 pub const CELLS: (usize, usize) = (8, 6);
-/// A board tilted by less than this tells little about the focal length, degrees.
-pub const TILTED_DEG: f64 = 15.0;
+/// Minimum tilt of a board, degrees. A smaller tilt contributes little information about the focal length.
+pub const MIN_TILT_DEG: f64 = 15.0;
 
-/// What the images cover.
+/// Coverage of the images.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Coverage {
-    /// Points in each cell, left and right image, row by row.
+    /// Number of points per cell, left and right image, row by row.
     pub cells: [Vec<usize>; 2],
     /// Tilt of the board against the left image plane in each pair, degrees, about the image's x and y axes.
     pub tilts_deg: Vec<[f64; 2]>,
@@ -21,7 +21,7 @@ pub struct Coverage {
 }
 
 impl Coverage {
-    /// Of the pairs used.
+    /// Coverage of the pairs used.
     pub fn of(pairs: &[Pair], state: &State) -> Self {
         let mut cells = [vec![0; CELLS.0 * CELLS.1], vec![0; CELLS.0 * CELLS.1]];
         for p in pairs {
@@ -50,18 +50,18 @@ impl Coverage {
         Self { cells, tilts_deg, distances_m }
     }
 
-    /// Part of a view's cells with points in them.
+    /// Fraction of the cells of a view that contain points.
     pub fn covered(&self, view: usize) -> f64 {
         self.cells[view].iter().filter(|c| **c > 0).count() as f64 / self.cells[view].len() as f64
     }
 
-    /// Pairs with the board tilted about the x and about the y axis, each way.
+    /// Number of pairs with the board tilted about the positive x, negative x, positive y and negative y axis.
     pub fn tilted(&self) -> [usize; 4] {
-        let count = |axis: usize, sign: f64| self.tilts_deg.iter().filter(|t| t[axis] * sign > TILTED_DEG).count();
+        let count = |axis: usize, sign: f64| self.tilts_deg.iter().filter(|t| t[axis] * sign > MIN_TILT_DEG).count();
         [count(0, 1.0), count(0, -1.0), count(1, 1.0), count(1, -1.0)]
     }
 
-    /// The range that the middle 80 % of the boards lie in, metres.
+    /// Range of the middle 80 % of the board distances, metres.
     pub fn usual_range_m(&self) -> [f64; 2] {
         let mut d = self.distances_m.clone();
         d.sort_by(f64::total_cmp);
@@ -69,25 +69,30 @@ impl Coverage {
         [at(0.1), at(0.9)]
     }
 
-    /// What is missing, in words; empty where nothing is.
+    /// Messages about missing coverage.
     pub fn gaps(&self) -> Vec<String> {
         let mut out = Vec::new();
         for (v, name) in ["left", "right"].into_iter().enumerate() {
             let covered = self.covered(v);
             if covered < 0.7 {
                 out.push(format!(
-                    "the target covered only {:.0} % of the {name} image: bring it to the borders and corners as well",
+                    "the target covers only {:.0} % of the {name} image: take images with the target at the borders and corners",
                     100.0 * covered
                 ));
             }
         }
-        let names = ["top towards the camera", "top away from the camera", "turned to the left", "turned to the right"];
+        let names = [
+            "with the top towards the camera",
+            "with the top away from the camera",
+            "turned to the left",
+            "turned to the right",
+        ];
         let missing: Vec<&str> =
             self.tilted().iter().zip(names).filter(|(n, _)| **n == 0).map(|(_, name)| name).collect();
         if !missing.is_empty() {
             out.push(format!(
-                "no image has the target tilted by more than {TILTED_DEG:.0} degrees with its {}",
-                missing.join("; or ")
+                "no image has the target tilted by more than {MIN_TILT_DEG:.0} degrees {}",
+                missing.join(" or ")
             ));
         }
         out

@@ -1,4 +1,4 @@
-//! Hold-out: each pair is judged by a calibration that was made without it.
+//! Hold-out: scores each pair with a calibration computed without it.
 
 use super::Pair;
 use super::bundle::{Problem, fit, fit_pose};
@@ -8,23 +8,23 @@ use super::solve::{Solved, free};
 use crate::calibrate::target::Target;
 use graspd_rt::geom::{Rig, View};
 
-/// Groups of pairs; one is held out at a time.
+/// Number of groups of pairs; one group is held out at a time.
 pub const FOLDS: usize = 4;
 
-/// What the held-out pairs say.
+/// Results on the held-out pairs.
 #[derive(Clone, Debug)]
 pub struct Holdout {
-    /// Pooled over all pairs, each held out once.
+    /// Scores pooled over all pairs, each held out once.
     pub scores: Scores,
-    /// The same of each pair, in the order of the pairs used.
+    /// Scores of each pair, in the order of the pairs used.
     pub per_pair: Vec<Scores>,
-    /// Reprojection errors with one board pose for both images, pixels, u and v of all points together.
+    /// Reprojection error of each point with one board pose for both images, pixels.
     pub reprojection_px: Vec<f64>,
     /// The rig of each group's fit.
     pub rigs: Vec<Rig>,
 }
 
-/// Runs it.
+/// Runs the hold-out; `None` if a fit fails.
 pub fn holdout(target: &Target, solved: &Solved, rational: bool) -> Option<Holdout> {
     let n = solved.used.len();
     let mut per_pair = vec![Scores::default(); n];

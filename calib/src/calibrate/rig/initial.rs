@@ -1,4 +1,4 @@
-//! Start values: homographies, focal lengths, each camera alone, relative pose.
+//! Start values from homographies: focal lengths, poses, and the fit of each camera alone.
 
 use super::Pair;
 use super::bundle::{Fit, Problem, fit};
@@ -7,10 +7,10 @@ use crate::calibrate::target::{Seen, Target};
 use graspd_rt::geom::{Camera, Distortion, Pose, Rig};
 use nalgebra::{DMatrix, Matrix2, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector2, Vector3};
 
-/// Focal lengths in image widths that are tried where the homographies do not tell: from a wide angle to a long lens.
+/// Focal lengths to try if the homographies do not determine one, in image widths: from wide-angle to telephoto lenses.
 const FOCAL_WIDTHS: [f64; 6] = [0.5, 0.8, 1.2, 1.8, 3.0, 6.0];
 
-/// One camera alone, from its views of the target. Views are given as the left ones of pairs.
+/// Calibrates one camera from its views of the target, which are passed as the left views of pairs.
 pub(super) fn single_camera(target: &Target, pairs: &[Pair], size: (u32, u32), rational: bool) -> Option<Fit> {
     let homographies: Vec<Matrix3<f64>> =
         pairs.iter().map(|p| homography(target, &p.seen[0])).collect::<Option<Vec<_>>>()?;
@@ -48,7 +48,7 @@ fn from_focal(
         bend: [0.0; 3],
         left_from_board: poses,
     };
-    // Few unknowns first: a principal point and five coefficients from a poor start run away together.
+    // Start with few unknowns: from a poor start, principal point and five coefficients diverge together.
     for stage in 0..2 {
         let mut free = [false; SHARED];
         for k in [0, 1, 4] {
@@ -102,8 +102,8 @@ pub(super) fn homography(target: &Target, seen: &[Seen]) -> Option<Matrix3<f64>>
     out.iter().all(|v| v.is_finite()).then_some(out)
 }
 
-/// Focal lengths from the homographies with the principal point in the middle: the columns of a rotation are orthogonal
-/// and equally long.
+/// Focal lengths from the homographies for a principal point in the image centre: the columns of a rotation are
+/// orthogonal and have equal lengths.
 fn focal_lengths(homographies: &[Matrix3<f64>], size: (u32, u32)) -> Option<Vector2<f64>> {
     let (cx, cy) = (0.5 * (f64::from(size.0) - 1.0), 0.5 * (f64::from(size.1) - 1.0));
     let centre = Matrix3::new(1.0, 0.0, -cx, 0.0, 1.0, -cy, 0.0, 0.0, 1.0);
@@ -111,7 +111,7 @@ fn focal_lengths(homographies: &[Matrix3<f64>], size: (u32, u32)) -> Option<Vect
     for h in homographies {
         let h = centre * h;
         let (p, q) = (h.column(0).into_owned(), h.column(1).into_owned());
-        // The sum and difference of the columns are as orthogonal as the columns themselves; both equations get one
+        // The sum and the difference of columns of equal length are orthogonal as well; both equations have the same
         // weight.
         let n = 1.0 / (p.norm() * q.norm());
         for (p, q) in [(p, q), ((p + q) * 0.5, (p - q) * 0.5)] {
@@ -124,7 +124,7 @@ fn focal_lengths(homographies: &[Matrix3<f64>], size: (u32, u32)) -> Option<Vect
     (w.x > 0.0 && w.y > 0.0).then(|| Vector2::new(1.0 / w.x.sqrt(), 1.0 / w.y.sqrt()))
 }
 
-/// A board's pose from its homography; the lens distortion is left out.
+/// Pose of a board from its homography, without lens distortion.
 fn pose_of(camera: &Camera, h: &Matrix3<f64>) -> Option<Pose> {
     let k = Matrix3::new(camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0);
     let m = k.try_inverse()? * h;
@@ -142,8 +142,7 @@ fn pose_of(camera: &Camera, h: &Matrix3<f64>) -> Option<Pose> {
     (t.z > 0.0 && t.iter().all(|v| v.is_finite())).then(|| Pose::from_parts(Translation3::from(t), rotation))
 }
 
-/// A board's pose in a calibrated camera from one view, for a start: homography of the points with the distortion
-/// removed.
+/// Start value of a board's pose from one view of a calibrated camera: homography of the undistorted points.
 pub(super) fn pose_from_view(target: &Target, camera: &Camera, seen: &[Seen]) -> Option<Pose> {
     let ideal = Camera { distortion: Distortion::default(), ..*camera };
     let straight: Vec<Seen> =

@@ -1,9 +1,10 @@
-//! From target points in both views to a calibrated rig that knows its own error.
+//! Calibration of the rig, with its uncertainty, from target points in both views.
 //!
-//! [`parameters`]: what is estimated, projection and its derivatives. [`bundle`]: the joint robust fit and its
-//! covariance. [`initial`]: start values. [`pairs`]: which pairs cannot be what they claim to be, and why. [`holdout`]
-//! and [`score`]: how good on images that were not used. [`predict`]: what the covariance means for a mark, and which
-//! image would help most. [`coverage`], [`verdict`]: words. [`calibrate()`]: all of it.
+//! [`parameters`]: the estimated parameters, projection and its derivatives. [`bundle`]: the joint robust fit and its
+//! covariance. [`initial`]: start values. [`pairs`]: rejection of inconsistent pairs, with the reason. [`holdout`] and
+//! [`score`]: accuracy on images that were not in the fit. [`predict`]: the mark error that follows from the
+//! covariance, and the most useful additional image. [`coverage`], [`verdict`]: the assessment of the result.
+//! [`check`]: test of a stored calibration. [`calibrate()`] runs the entire estimate.
 
 pub mod bundle;
 mod calibration;
@@ -27,63 +28,63 @@ pub use calibration::{Calibration, Options, calibrate};
 
 use crate::calibrate::target::Seen;
 
-/// A pair of images with the target's points in them.
+/// Target points of a pair of images.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pair {
-    /// A name for people: the left image's.
+    /// Display name: that of the left image.
     pub name: String,
-    /// Points in the left and in the right image.
+    /// Points in the left and in the right image, sorted by index.
     pub seen: [Vec<Seen>; 2],
-    /// Width of the edges in both, pixels.
+    /// Blur of the edges in both images, pixels.
     pub blur_px: [f64; 2],
 }
 
-/// Fewest pairs that are calibrated from: hold-out needs four groups, and fewer views leave lens and pose mixed up.
-pub const LEAST_PAIRS: usize = 5;
+/// Minimum number of pairs. The hold-out needs four groups, and fewer views do not separate the lens from the poses.
+pub const MIN_PAIRS: usize = 5;
 
-/// Why there is no calibration.
+/// Reason why the calibration failed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum CalibrateError {
     /// Too few pairs.
     #[error(
-        "only {found} pairs can be used, {LEAST_PAIRS} are needed and 15 to 30 are good: take more, with the target tilted by 20 to 45 degrees in different directions, and in all parts of the image"
+        "only {found} pairs can be used, at least {MIN_PAIRS} are needed and 15 to 30 are recommended: take more pairs with the target tilted by 20 to 45 degrees in different directions, and in all parts of the image"
     )]
     TooFew {
-        /// Pairs that can be used.
+        /// Number of usable pairs.
         found: usize,
     },
-    /// A camera alone cannot be calibrated.
+    /// The calibration of a single camera failed.
     #[error(
-        "the {side} camera cannot be calibrated from its images: no lens and poses explain the points; check --target, and tilt the target"
+        "calibration of the {side} camera alone failed: no lens and target poses explain the points; check --target, and tilt the target"
     )]
     Camera {
-        /// Which one.
+        /// Name of the camera.
         side: &'static str,
     },
-    /// The pairs do not agree on a rig.
+    /// The pairs do not agree on a relative pose of the cameras.
     #[error(
-        "the pairs do not agree on where the cameras stand (the median pair is off by {median_px:.0} px): {}",
-        guess.unwrap_or("the images of a pair were not taken at the same time, the cameras moved between pairs, or the lists do not belong together")
+        "the pairs do not agree on the relative pose of the cameras (median disagreement {median_px:.0} px): {}",
+        guess.unwrap_or("the images of a pair were not taken at the same time, the cameras moved between pairs, or the lists are not from the same recording")
     )]
     NoCommonRig {
-        /// How far the median pair is off, pixels.
+        /// Median disagreement of the pairs, pixels.
         median_px: f64,
-        /// What would make them agree.
+        /// Change of the input under which the pairs agree.
         guess: Option<&'static str>,
     },
-    /// The fit does not come to an end.
+    /// The joint fit does not converge.
     #[error("the joint fit does not converge: take more pairs, with the target tilted in different directions")]
     NoFit,
-    /// The lens model folds.
+    /// The lens model is not one-to-one over the image.
     #[error(
-        "the {side} lens model folds the image over itself: the target was not seen near the image's corners, where the coefficients run free; take images there"
+        "the lens model of the {side} camera is not one-to-one over the image: its coefficients are undetermined without target points near the image corners; take images with the target there"
     )]
     Folds {
-        /// Which camera.
+        /// Name of the camera.
         side: &'static str,
     },
-    /// Nothing is seen by both cameras there.
-    #[error("nothing between {:.2} and {:.2} m is seen by both cameras: give --volume as NEAR,FAR in metres", range_m[0], range_m[1])]
+    /// The views of the cameras do not overlap in the volume.
+    #[error("the views of the two cameras do not overlap between {:.2} and {:.2} m: give --volume as NEAR,FAR in metres", range_m[0], range_m[1])]
     NoVolume {
         /// Distances, metres.
         range_m: [f64; 2],

@@ -1,9 +1,10 @@
-//! Which pairs cannot be what they claim to be: one board, at one place, in both images; and why not.
+//! Test whether a pair shows one board in one pose in both images, and diagnosis of the pairs that fail it.
 //!
-//! The test is a likelihood ratio. Each image alone gives a pose of the board; both together, with the rig, give one
-//! pose that has to explain both. What chi squared rises by has six degrees of freedom where the pair is good, whatever
-//! the residuals are: a pair that only fits badly is not left out, and no target for the residuals enters. Where all
-//! pairs rise by more (a lens that the model does not quite describe), the usual rise is the measure.
+//! The test is a likelihood ratio. Each image alone determines a pose of the board; both images together, with the rig,
+//! determine one pose that must explain both. For a consistent pair the increase in chi squared (the rise) has six
+//! degrees of freedom, independently of the residuals. Large residuals alone therefore never exclude a pair, and there
+//! is no limit on them. If the rise is larger in all pairs (a lens that the model does not describe exactly), it is
+//! compared with the usual rise of the set.
 
 use super::Pair;
 use super::bundle::{Noise, PoseFit, fit_pose};
@@ -12,46 +13,46 @@ use super::parameters::State;
 use crate::calibrate::target::{Seen, Target};
 use graspd_rt::geom::{Pose, View};
 
-/// Rise of chi squared a degree of freedom from which a pair is wrong, in usual rises. Of good pairs with normal noise
-/// less than 1 in 10^20 reaches it; a board of 54 points moved by three times their noise between the images reaches
-/// 40. The margin is for what differs between the images of a real set: the usual rise is a median, single pairs are
-/// several times above it.
-pub const WRONG: f64 = 20.0;
-/// Median of chi squared with six degrees of freedom, a degree.
-const MEDIAN_6: f64 = 0.891;
-/// Chi squared a degree of freedom of one image alone, in the usual one, from which its points are no flat board of
-/// that size.
-const NOT_A_BOARD: f64 = 12.0;
-/// Edges this many times as wide as usual are blurred by motion or focus.
-const BLURRED: f64 = 2.5;
-/// No edge is called blurred below this width, pixels.
-const BLURRED_PX: f64 = 1.5;
-/// Steps by which a board's labels may be shifted.
-const SHIFTS: i64 = 2;
+/// Maximum rise of chi squared per degree of freedom of a consistent pair, as a multiple of the usual rise. With normal
+/// noise fewer than 1 in 10^20 consistent pairs reach it; a board of 54 points that moves by three times their noise
+/// between the images reaches 40. The margin covers differences between the images of a real set: the usual rise is a
+/// median, and single pairs are several times above it.
+pub const MAX_RISE_RATIO: f64 = 20.0;
+/// Median of chi squared with six degrees of freedom, per degree of freedom.
+const MEDIAN_CHI2_6: f64 = 0.891;
+/// Maximum chi squared per degree of freedom of one image alone, as a multiple of the usual value. Above it the points
+/// are not on a flat board of the given size.
+const MAX_ALONE_RATIO: f64 = 12.0;
+/// Maximum width of the edges as a multiple of the usual width. Above it the image is blurred by motion or defocus.
+const MAX_BLUR_RATIO: f64 = 2.5;
+/// Minimum edge width of a blurred image, pixels.
+const MIN_BLUR_PX: f64 = 1.5;
+/// Maximum shift of a board's labels that is tested, squares.
+const MAX_SHIFT_SQUARES: i64 = 2;
 
-/// A pair that is left out.
+/// An excluded pair.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LeftOut {
-    /// Which one.
+    /// Name of the pair.
     pub name: String,
-    /// A word for machines: "moved", "shifted", "mirrored", "swapped", "other-pair", "blurred", "not-a-board".
+    /// Identifier of the reason: "moved", "shifted", "mirrored", "swapped", "other-pair", "blurred", "not-a-board".
     pub kind: &'static str,
-    /// Why, for people.
+    /// Message with the reason.
     pub reason: String,
 }
 
-/// What one pair says against a calibration.
+/// Test of one pair under a calibration.
 #[derive(Clone, Debug)]
 pub struct Test {
-    /// Rise of chi squared, a degree of freedom.
+    /// Rise of chi squared per degree of freedom.
     pub rise: f64,
-    /// Chi squared a degree of freedom of each image alone.
+    /// Chi squared per degree of freedom of each image alone.
     pub alone: [f64; 2],
     /// The board's pose in the left frame from the left image, from the right image, from both.
     pub poses: [Pose; 3],
 }
 
-/// Tests a pair; `None` where no pose can be found at all.
+/// Tests a pair; `None` if no pose can be estimated.
 pub fn test(target: &Target, state: &State, noise: &Noise, pair: &Pair) -> Option<Test> {
     let only = |v: usize| {
         let mut p = pair.clone();
@@ -76,17 +77,17 @@ pub fn test(target: &Target, state: &State, noise: &Noise, pair: &Pair) -> Optio
         .min_by(|a, b| a.chi2.total_cmp(&b.chi2));
     let alone = [0, 1].map(|k| fits[k].chi2 / (2.0 * pair.seen[k].len() as f64 - 6.0).max(1.0));
     let separate: f64 = fits.iter().map(|f| f.chi2).sum();
-    // A board that one image puts behind the other camera has no common pose.
+    // There is no common pose if one image places the board behind the other camera.
     let (rise, pose) = both.map_or((f64::MAX, fits[0].pose), |b| ((b.chi2 - separate) / 6.0, b.pose));
     Some(Test { rise, alone, poses: [fits[0].pose, fits[1].pose, pose] })
 }
 
-/// The usual rise: 1 where the noise is what the residuals say.
+/// The usual rise; 1 if the noise agrees with the residuals.
 pub fn usual_rise(tests: &[Test]) -> f64 {
-    (median(tests.iter().map(|t| t.rise)) / MEDIAN_6).max(1.0)
+    (median(tests.iter().map(|t| t.rise)) / MEDIAN_CHI2_6).max(1.0)
 }
 
-/// The usual chi squared a degree of freedom of an image alone.
+/// The usual chi squared per degree of freedom of an image alone.
 pub fn usual_alone(tests: &[Test]) -> f64 {
     median(tests.iter().flat_map(|t| t.alone)).max(1e-3)
 }
@@ -97,17 +98,17 @@ pub(super) fn median(values: impl Iterator<Item = f64>) -> f64 {
     v.get(v.len() / 2).copied().unwrap_or(1.0)
 }
 
-/// Pairs that are blurred against the others of the set.
+/// For each pair, the exclusion if it is blurred compared with the rest of the set.
 pub fn blurred(pairs: &[Pair]) -> Vec<Option<LeftOut>> {
     let usual = [0, 1].map(|v| median(pairs.iter().map(|p| p.blur_px[v])));
     pairs
         .iter()
         .map(|p| {
-            (0..2).find(|v| p.blur_px[*v] > BLURRED_PX && p.blur_px[*v] > BLURRED * usual[*v]).map(|v| LeftOut {
+            (0..2).find(|v| p.blur_px[*v] > MIN_BLUR_PX && p.blur_px[*v] > MAX_BLUR_RATIO * usual[*v]).map(|v| LeftOut {
                 name: p.name.clone(),
                 kind: "blurred",
                 reason: format!(
-                    "the {} image is blurred: its edges are {:.1} px wide, those of the others {:.1} px; hold the target still, or shorten the exposure",
+                    "the {} image is blurred: its edges are {:.1} px wide, the median of the set is {:.1} px; hold the target still, or shorten the exposure",
                     side(v),
                     p.blur_px[v],
                     usual[v]
@@ -121,8 +122,8 @@ fn side(v: usize) -> &'static str {
     if v == 0 { "left" } else { "right" }
 }
 
-/// What a set is held against: a calibration, and what is usual in it.
-pub struct Judge<'a> {
+/// A calibration and the usual values of the set, against which pairs are tested.
+pub struct PairCriteria<'a> {
     /// The target.
     pub target: &'a Target,
     /// The calibration.
@@ -135,26 +136,26 @@ pub struct Judge<'a> {
     pub usual_alone: f64,
 }
 
-impl Judge<'_> {
-    /// Whether a pair is good.
-    pub fn good(&self, t: &Test) -> bool {
-        t.rise < WRONG * self.usual && self.is_board(t).is_none()
+impl PairCriteria<'_> {
+    /// Whether a pair is consistent.
+    pub fn consistent(&self, t: &Test) -> bool {
+        t.rise < MAX_RISE_RATIO * self.usual && self.not_a_board(t).is_none()
     }
 
-    /// The image whose points are no flat board of the target's size.
-    fn is_board(&self, t: &Test) -> Option<usize> {
-        (0..2).find(|v| !(t.alone[*v] < NOT_A_BOARD * self.usual_alone.max(1.0)))
+    /// The view whose points are not on a flat board of the target's size.
+    fn not_a_board(&self, t: &Test) -> Option<usize> {
+        (0..2).find(|v| !(t.alone[*v] < MAX_ALONE_RATIO * self.usual_alone.max(1.0)))
     }
 
     fn explains(&self, pair: &Pair) -> bool {
-        test(self.target, self.state, &self.noise, pair).is_some_and(|t| self.good(&t))
+        test(self.target, self.state, &self.noise, pair).is_some_and(|t| self.consistent(&t))
     }
 
-    /// The pair with its right labels turned as the board looks the same, where that makes it good: no fault, an
-    /// ambiguity.
-    pub fn turned(&self, pair: &Pair) -> Option<Pair> {
-        let mut turns = self.target.turns().into_iter().skip(1);
-        turns.find_map(|map| {
+    /// The pair with its right labels rotated by a symmetry of the board, if that makes the pair consistent. Such a
+    /// pair is ambiguous, not faulty.
+    pub fn relabelled(&self, pair: &Pair) -> Option<Pair> {
+        let mut rotations = self.target.rotations().into_iter().skip(1);
+        rotations.find_map(|map| {
             let mut p = pair.clone();
             for s in &mut p.seen[1] {
                 s.index = *map.get(s.index)?;
@@ -164,14 +165,15 @@ impl Judge<'_> {
         })
     }
 
-    /// Why a pair is wrong. `all` are the pairs of the set, to find a right image that belongs to another left one.
+    /// Diagnoses an inconsistent pair. `all` are the pairs of the set, searched for the left image that its right image
+    /// belongs to.
     pub fn reason(&self, pair: &Pair, t: Option<&Test>, all: &[Pair]) -> LeftOut {
         let out = |kind: &'static str, reason: String| LeftOut { name: pair.name.clone(), kind, reason };
         if let Some(other) = all.iter().find(|o| o.name != pair.name && self.explains(&with_right(pair, o))) {
             return out(
                 "other-pair",
                 format!(
-                    "its right image belongs to {}: the images are paired in another order than they were taken",
+                    "its right image fits {}: the images are not paired in the order in which they were taken",
                     other.name
                 ),
             );
@@ -192,18 +194,18 @@ impl Judge<'_> {
             return out(
                 "shifted",
                 format!(
-                    "the right image fits with the board {c} columns and {r} rows beside: the board was moved by whole squares between the two images, or a part of another board was taken for it"
+                    "the right image fits if its labels are shifted by {c} columns and {r} rows: the board moved by an integer number of squares between the two images, or another part of the board was detected"
                 ),
             );
         }
         let Some(t) = t else {
-            return out("not-a-board", "no pose of the board explains its points".to_owned());
+            return out("not-a-board", "no pose of the board explains the points".to_owned());
         };
-        if let Some(v) = self.is_board(t) {
+        if let Some(v) = self.not_a_board(t) {
             return out(
                 "not-a-board",
                 format!(
-                    "the points of the {} image do not lie on a flat board of this size: another target, a wrong grid, or a bent board",
+                    "the points of the {} image are not on a flat board of this size: the image shows another target, the grid is wrong, or the board is bent",
                     side(v)
                 ),
             );
@@ -215,16 +217,18 @@ impl Judge<'_> {
         out(
             "moved",
             format!(
-                "not taken at the same time: between its two images the board moved by {moved:.1} mm and turned by {:.2} degrees; hold the target still, or trigger both cameras together",
+                "the images were not taken at the same time: the board moved by {moved:.1} mm and rotated by {:.2} degrees between them; hold the target still, or trigger both cameras together",
                 motion.rotation.angle().to_degrees()
             ),
         )
     }
 
-    /// Whole squares by which the right labels are shifted.
+    /// Columns and rows by which the right labels are shifted.
     fn shift(&self, pair: &Pair) -> Option<(i64, i64)> {
         let (n, m) = (self.target.cols as i64, self.target.rows as i64);
-        let shifts = (-SHIFTS..=SHIFTS).flat_map(|c| (-SHIFTS..=SHIFTS).map(move |r| (c, r))).filter(|s| *s != (0, 0));
+        let shifts = (-MAX_SHIFT_SQUARES..=MAX_SHIFT_SQUARES)
+            .flat_map(|c| (-MAX_SHIFT_SQUARES..=MAX_SHIFT_SQUARES).map(move |r| (c, r)))
+            .filter(|s| *s != (0, 0));
         shifts.into_iter().find(|&(dc, dr)| {
             let mut p = pair.clone();
             p.seen[1] = pair.seen[1]
@@ -248,7 +252,7 @@ fn swapped(pair: &Pair) -> Pair {
     Pair { seen: [pair.seen[1].clone(), pair.seen[0].clone()], ..pair.clone() }
 }
 
-/// The pair with images mirrored back.
+/// The pair with the images of `views` mirrored.
 pub(super) fn mirrored(target: &Target, state: &State, pair: &Pair, views: [bool; 2]) -> Pair {
     let mut out = pair.clone();
     for v in View::BOTH {

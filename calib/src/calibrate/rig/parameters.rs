@@ -1,18 +1,19 @@
-//! What is estimated: both cameras, their relative pose, how the board is bent; and where each pair's board stood.
+//! The estimated parameters: both cameras, their relative pose, the bending of the board, and the board's pose in each
+//! pair.
 
 use crate::calibrate::target::Target;
 use graspd_rt::geom::{Camera, Normalized, Pixel, Pose, Rig, Vec3, exp_twist};
 use nalgebra::{Matrix2, SMatrix, Vector2, Vector6};
 
-/// Parameters of a camera: fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6.
+/// Number of parameters of a camera: fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6.
 pub const CAMERA: usize = 12;
-/// Shared parameters: two cameras, the right camera's twist (m, rad; translation first), three bending terms.
+/// Number of shared parameters: two cameras, the right camera's twist (m, rad; translation first), three bending terms.
 pub const SHARED: usize = 2 * CAMERA + 6 + BEND;
-/// Where the twist begins.
+/// Index of the first component of the twist.
 pub const TWIST: usize = 2 * CAMERA;
-/// Where the bending begins.
+/// Index of the first bending term.
 pub const BENDING: usize = TWIST + 6;
-/// Bending terms: of x squared, of x y, of y squared.
+/// Number of bending terms: coefficients of x squared, x y, y squared.
 pub const BEND: usize = 3;
 /// Names of the shared parameters, in order.
 pub const NAMES: [&str; SHARED] = [
@@ -53,7 +54,7 @@ pub const NAMES: [&str; SHARED] = [
 
 /// A step of the shared parameters.
 pub type SharedStep = nalgebra::SVector<f64, SHARED>;
-/// Derivative of a pixel by the shared parameters.
+/// Derivative of a pixel with respect to the shared parameters.
 pub type SharedJacobian = SMatrix<f64, 2, SHARED>;
 
 /// The estimate.
@@ -61,14 +62,14 @@ pub type SharedJacobian = SMatrix<f64, 2, SHARED>;
 pub struct State {
     /// Both cameras and their relative pose.
     pub rig: Rig,
-    /// How far the board stands out of its plane, metres, per unit of its bending shapes.
+    /// Coefficients of the bending shapes: deviation of the board from its plane, metres.
     pub bend: [f64; BEND],
-    /// Where the board of each pair stood, in the left camera's frame.
+    /// Pose of the board of each pair in the left camera's frame.
     pub left_from_board: Vec<Pose>,
 }
 
-/// Bending shapes of the board at a point: quadratic in the coordinates from -1 to 1 over the board, without mean, so
-/// that they are no change of pose.
+/// Bending shapes of the board at a point: quadratic in coordinates from -1 to 1 over the board, with zero mean, so
+/// that they do not include a change of pose.
 pub fn bending_shapes(target: &Target, point: &Vector2<f64>) -> [f64; BEND] {
     let size = target.size();
     let (x, y) = (2.0 * point.x / size.x - 1.0, 2.0 * point.y / size.y - 1.0);
@@ -76,14 +77,14 @@ pub fn bending_shapes(target: &Target, point: &Vector2<f64>) -> [f64; BEND] {
 }
 
 impl State {
-    /// A point of the target in the board's frame, metres, with its bending.
+    /// A target point with bending in the board's frame, metres.
     pub fn board_point(&self, target: &Target, index: usize) -> Vec3 {
         let p = target.point(index);
         let z = bending_shapes(target, &p).iter().zip(&self.bend).map(|(s, b)| s * b).sum();
         Vec3::new(p.x, p.y, z)
     }
 
-    /// Moves the shared parameters.
+    /// Applies a step of the shared parameters.
     pub fn stepped(&mut self, d: &SharedStep) {
         step_camera(&mut self.rig.left, d.fixed_rows::<CAMERA>(0).as_slice());
         step_camera(&mut self.rig.right, d.fixed_rows::<CAMERA>(CAMERA).as_slice());
@@ -95,7 +96,7 @@ impl State {
     }
 }
 
-/// A pose whose quaternion has unit length again after many products.
+/// The pose with its quaternion renormalised, against drift over many products.
 pub(super) fn renormalised(mut pose: Pose) -> Pose {
     pose.rotation.renormalize();
     pose
@@ -118,7 +119,7 @@ pub fn camera_values(c: &Camera) -> [f64; CAMERA] {
     [c.fx, c.fy, c.cx, c.cy, k.k1, k.k2, k.p1, k.p2, k.k3, k.k4, k.k5, k.k6]
 }
 
-/// Pixel of a normalized point, its derivative by the point, and by the camera's parameters.
+/// Pixel of a normalized point, and its derivatives with respect to the point and to the camera's parameters.
 pub fn camera_jacobian(c: &Camera, n: Normalized) -> (Pixel, Matrix2<f64>, SMatrix<f64, 2, CAMERA>) {
     let (p, jn) = c.distort_with_jacobian(n);
     let d = &c.distortion;
@@ -148,13 +149,12 @@ pub fn camera_jacobian(c: &Camera, n: Normalized) -> (Pixel, Matrix2<f64>, SMatr
     (p, jn, j)
 }
 
-/// Where a camera sees the centroid of a disc's image less where it sees its centre, pixels: the projective and lens
-/// bias of circle targets, by quadrature over the disc. `along` and `across` span the disc's plane, unit length, in the
-/// camera's frame.
+/// Centroid of a disc's image minus the image of its centre, pixels: the projective and lens bias of circle targets, by
+/// quadrature over the disc. `along` and `across` are unit vectors that span the disc's plane, in the camera's frame.
 pub fn disc_bias(c: &Camera, centre: &Vec3, along: &Vec3, across: &Vec3, radius: f64) -> Option<Vector2<f64>> {
     let at_centre = c.project(centre)?;
     let (mut sum, mut weight) = (Vector2::zeros(), 0.0);
-    // Gauss points of the disc in r squared (2) by 8 angles: exact for polynomials of degree 3 in r squared.
+    // 2 Gauss points in r squared by 8 angles: exact for polynomials of degree 3 in r squared.
     for s in [0.5 - 0.5 / 3f64.sqrt(), 0.5 + 0.5 / 3f64.sqrt()] {
         for k in 0..8 {
             let (sin, cos) = (std::f64::consts::TAU * f64::from(k) / 8.0).sin_cos();
@@ -169,17 +169,17 @@ pub fn disc_bias(c: &Camera, centre: &Vec3, along: &Vec3, across: &Vec3, radius:
     (weight > 0.0).then(|| sum / weight)
 }
 
-/// What a view's pixel of a target point depends on.
+/// A projected target point with its derivatives.
 pub struct Projected {
     /// The pixel.
     pub at: Pixel,
-    /// By the shared parameters.
+    /// Derivative with respect to the shared parameters.
     pub shared: SharedJacobian,
-    /// By the board's twist in the left frame (translation first).
+    /// Derivative with respect to the board's twist in the left frame (translation first).
     pub pose: SMatrix<f64, 2, 6>,
 }
 
-/// Projects a target point of a pair into a view with all derivatives; `None` behind the camera.
+/// Projects a target point of a pair into a view with its derivatives; `None` for a point behind the camera.
 pub fn project(state: &State, target: &Target, pose: &Pose, view: usize, index: usize) -> Option<Projected> {
     let point = target.point(index);
     let x_board = state.board_point(target, index);
@@ -211,7 +211,7 @@ pub fn project(state: &State, target: &Target, pose: &Pose, view: usize, index: 
     Some(Projected { at, shared, pose: twist_jacobian(&j_left, &x_left) })
 }
 
-/// Derivative by a twist (translation first) of the frame in which `x` is given.
+/// Derivative with respect to a twist (translation first) in the frame of `x`.
 fn twist_jacobian(jx: &SMatrix<f64, 2, 3>, x: &Vec3) -> SMatrix<f64, 2, 6> {
     let mut j = SMatrix::<f64, 2, 6>::zeros();
     j.fixed_view_mut::<2, 3>(0, 0).copy_from(jx);
@@ -226,7 +226,7 @@ mod tests {
     use graspd_rt::geom::Distortion;
 
     #[test]
-    fn every_derivative_agrees_with_finite_differences() {
+    fn derivatives_agree_with_finite_differences() {
         let d = Distortion { k1: -0.3, k2: 0.1, p1: 2e-3, p2: -1e-3, k3: -0.05, k4: 0.1, k5: -0.03, k6: 0.02 };
         let left = Camera { width: 640, height: 480, fx: 530.0, fy: 533.0, cx: 340.0, cy: 235.0, distortion: d };
         let right = Camera { fx: 541.0, cx: 321.0, ..left };
@@ -263,16 +263,16 @@ mod tests {
         }
     }
 
-    /// A dense polygon of the disc's outline has the same centroid as the quadrature says.
+    /// The quadrature agrees with the centroid of a dense polygon along the disc's outline.
     #[test]
-    fn the_disc_bias_is_that_of_the_outline() {
+    fn the_disc_bias_agrees_with_the_outline() {
         let d = Distortion { k1: -0.25, k2: 0.08, p1: 1e-3, ..Default::default() };
         let c = Camera { width: 1280, height: 960, fx: 1000.0, fy: 1003.0, cx: 630.0, cy: 470.0, distortion: d };
         let centre = Vec3::new(0.15, -0.1, 0.5);
         let along = Vec3::new(0.7, 0.0, 0.7).normalize();
         let across = Vec3::y();
         let radius = 0.02;
-        let said = disc_bias(&c, &centre, &along, &across, radius).unwrap();
+        let bias = disc_bias(&c, &centre, &along, &across, radius).unwrap();
         let outline: Vec<Pixel> = (0..4000)
             .map(|k| {
                 let (s, co) = (std::f64::consts::TAU * f64::from(k) / 4000.0).sin_cos();
@@ -286,7 +286,7 @@ mod tests {
             sum += (a + b) * cross / 6.0;
         }
         let exact = sum / area - c.project(&centre).unwrap();
-        assert!(exact.norm() > 0.2, "a bias worth removing: {exact}");
-        assert!((said - exact).norm() < 0.01 * exact.norm(), "{said} against {exact}");
+        assert!(exact.norm() > 0.2, "the bias is too small for a test: {exact}");
+        assert!((bias - exact).norm() < 0.01 * exact.norm(), "{bias}, expected {exact}");
     }
 }

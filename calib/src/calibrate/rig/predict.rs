@@ -1,5 +1,5 @@
-//! What the covariance of a rig means for a mark: how far off a triangulated point is, and how far from its epipolar
-//! line; and which image would lower that most.
+//! Prediction of the mark error from the covariance of a rig: position error of a triangulated point, distance from its
+//! epipolar line, and the additional pair that reduces them most.
 
 use super::Pair;
 use super::bundle::{Noise, Problem, Shared, covariance, pair_information};
@@ -8,27 +8,27 @@ use crate::calibrate::target::{Seen, Target};
 use graspd_rt::geom::{Camera, Pixel, Pose, Rig, Vec3, View, exp_twist};
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix3x4, Matrix4x3, SMatrix, Vector2, Vector4, Vector6};
 
-/// Places of the volume across, down, and in depth.
-const PLACES: (usize, usize, usize) = (5, 4, 3);
-/// A place counts where it is this far inside both images, pixels.
-const MARGIN_PX: f64 = 5.0;
+/// Number of points in the volume: horizontally, vertically and in depth.
+const VOLUME_GRID: (usize, usize, usize) = (5, 4, 3);
+/// Minimum distance of a projected point from the image border, pixels.
+const MIN_MARGIN_PX: f64 = 5.0;
 
-type PlaceJacobian = SMatrix<f64, 3, SHARED>;
+type PositionJacobian = SMatrix<f64, 3, SHARED>;
 
-/// A volume in front of the rig, as the places in it that both cameras see.
+/// A volume in front of the rig, sampled by points that both cameras see.
 #[derive(Clone, Debug)]
 pub struct Volume {
     /// Nearest and farthest distance from the left camera along its axis, metres.
     pub range_m: [f64; 2],
-    /// Places, left frame, metres.
-    pub places: Vec<Vec3>,
+    /// Sample points in the left frame, metres.
+    pub points: Vec<Vec3>,
 }
 
 impl Volume {
-    /// The part between two distances that both cameras see.
+    /// The common view of the cameras between two distances.
     pub fn new(rig: &Rig, range_m: [f64; 2]) -> Self {
-        let (nu, nv, nz) = PLACES;
-        let mut places = Vec::new();
+        let (nu, nv, nz) = VOLUME_GRID;
+        let mut points = Vec::new();
         let step = |k: usize, n: usize| (k as f64 + 0.5) / n as f64;
         for k in 0..nz {
             let z = range_m[0] + (range_m[1] - range_m[0]) * k as f64 / (nz - 1) as f64;
@@ -38,30 +38,30 @@ impl Volume {
                     let p = Pixel::new(step(i, nu) * size.x, step(j, nv) * size.y);
                     let Some(n) = rig.left.undistort(p) else { continue };
                     let x = Vec3::new(n.x * z, n.y * z, z);
-                    if rig.project(View::Right, &x).is_some_and(|q| rig.right.contains(q, MARGIN_PX)) {
-                        places.push(x);
+                    if rig.project(View::Right, &x).is_some_and(|q| rig.right.contains(q, MIN_MARGIN_PX)) {
+                        points.push(x);
                     }
                 }
             }
         }
-        Self { range_m, places }
+        Self { range_m, points }
     }
 }
 
-/// How far off marks are by the calibration alone, one standard deviation.
+/// Mark error caused by the calibration alone, one standard deviation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct MarkError {
-    /// Length of the error in space, root mean square over the volume, metres.
+    /// Length of the position error, root mean square over the volume, metres.
     pub rms_m: f64,
-    /// The same at the worst place.
+    /// Maximum length of the position error over the volume, metres.
     pub worst_m: f64,
     /// Distance from the epipolar line in the right image, root mean square over the volume, pixels.
     pub epipolar_px: f64,
 }
 
-/// Derivatives of where a mark is triangulated, and of its distance from the epipolar line, by the shared parameters;
-/// its four image coordinates held.
-fn mark_jacobian(rig: &Rig, x_left: &Vec3) -> Option<(PlaceJacobian, SMatrix<f64, 1, SHARED>)> {
+/// Derivatives of the triangulated position of a mark and of its distance from the epipolar line with respect to the
+/// shared parameters, with its four image coordinates fixed.
+fn mark_jacobian(rig: &Rig, x_left: &Vec3) -> Option<(PositionJacobian, SMatrix<f64, 1, SHARED>)> {
     let mut by_point = Matrix4x3::zeros();
     let mut by_shared = SMatrix::<f64, 4, SHARED>::zeros();
     for v in View::BOTH {
@@ -71,7 +71,7 @@ fn mark_jacobian(rig: &Rig, x_left: &Vec3) -> Option<(PlaceJacobian, SMatrix<f64
     }
     let inverse = (by_point.tr_mul(&by_point)).try_inverse()?;
     let back: Matrix3x4<f64> = inverse * by_point.transpose();
-    // The one direction of the four coordinates that no motion of the point explains.
+    // The direction in the space of the four coordinates that no motion of the point explains.
     let mut normal = Vector4::zeros();
     for k in 0..4 {
         let e = Vector4::ith(k, 1.0);
@@ -85,10 +85,10 @@ fn mark_jacobian(rig: &Rig, x_left: &Vec3) -> Option<(PlaceJacobian, SMatrix<f64
     (right > 1e-6).then(|| (-(back * by_shared), normal.transpose() * by_shared / right))
 }
 
-/// Derivative of a view's pixel by a point of the left frame and by the shared parameters.
+/// Derivatives of a view's pixel with respect to a point in the left frame and to the shared parameters.
 fn point_jacobian(rig: &Rig, view: View, x_left: &Vec3) -> Option<(Matrix2x3<f64>, SharedJacobian)> {
-    let place = rig.view_from_left(view);
-    let x = (place * nalgebra::Point3::from(*x_left)).coords;
+    let view_from_left = rig.view_from_left(view);
+    let x = (view_from_left * nalgebra::Point3::from(*x_left)).coords;
     if !(x.z > 1e-6) {
         return None;
     }
@@ -102,24 +102,24 @@ fn point_jacobian(rig: &Rig, view: View, x_left: &Vec3) -> Option<(Matrix2x3<f64
         let turn = Matrix3::new(0.0, x.z, -x.y, -x.z, 0.0, x.x, x.y, -x.x, 0.0);
         shared.fixed_view_mut::<2, 3>(0, TWIST + 3).copy_from(&(jx * turn));
     }
-    Some((jx * place.rotation.to_rotation_matrix().matrix(), shared))
+    Some((jx * view_from_left.rotation.to_rotation_matrix().matrix(), shared))
 }
 
-/// Derivatives at every place of a volume, so that many covariances can be asked.
-pub struct Sensitivity(Vec<(PlaceJacobian, SMatrix<f64, 1, SHARED>)>);
+/// Derivatives at every point of a volume, for evaluation of many covariances.
+pub struct Sensitivity(Vec<(PositionJacobian, SMatrix<f64, 1, SHARED>)>);
 
 impl Sensitivity {
-    /// Of a rig over a volume.
+    /// Derivatives for a rig over a volume.
     pub fn new(rig: &Rig, volume: &Volume) -> Self {
-        Self(volume.places.iter().filter_map(|x| mark_jacobian(rig, x)).collect())
+        Self(volume.points.iter().filter_map(|x| mark_jacobian(rig, x)).collect())
     }
 
-    /// What a covariance of the shared parameters means.
+    /// Mark error for a covariance of the shared parameters.
     pub fn error(&self, covariance: &Shared) -> MarkError {
         let mut out = MarkError::default();
         let n = self.0.len().max(1) as f64;
-        for (place, epipolar) in &self.0 {
-            let m2 = (place * covariance * place.transpose()).trace().max(0.0);
+        for (position, epipolar) in &self.0 {
+            let m2 = (position * covariance * position.transpose()).trace().max(0.0);
             out.rms_m += m2 / n;
             out.worst_m = out.worst_m.max(m2.sqrt());
             out.epipolar_px += (epipolar * covariance * epipolar.transpose())[0].max(0.0) / n;
@@ -128,21 +128,21 @@ impl Sensitivity {
     }
 }
 
-/// How far marks move when groups of pairs are left out, as a standard deviation (the jackknife over groups), metres:
-/// it knows nothing of noise models, and so sees what they leave out.
+/// Mark error from the jackknife over groups of pairs, one standard deviation, metres. It does not depend on the noise
+/// model, and therefore includes effects that the model omits.
 pub fn jackknife_m(rig: &Rig, others: &[Rig], volume: &Volume) -> f64 {
     let g = others.len() as f64;
     let mut sum = 0.0;
-    for x in &volume.places {
+    for x in &volume.points {
         let moved = others.iter().filter_map(|o| Some(triangulated(rig, o, x)? - x));
         let all: Vec<Vec3> = moved.collect();
         let mean = all.iter().sum::<Vec3>() / all.len().max(1) as f64;
         sum += (g - 1.0) / g * all.iter().map(|d| (d - mean).norm_squared()).sum::<f64>();
     }
-    (sum / volume.places.len().max(1) as f64).sqrt()
+    (sum / volume.points.len().max(1) as f64).sqrt()
 }
 
-/// Where another rig sees the pixels that this one sees of a point.
+/// Projects a point with one rig and triangulates the pixels with another.
 fn triangulated(rig: &Rig, other: &Rig, x: &Vec3) -> Option<Vec3> {
     let pixels = [rig.project(View::Left, x)?, rig.project(View::Right, x)?];
     let mut at = *x;
@@ -159,16 +159,16 @@ fn triangulated(rig: &Rig, other: &Rig, x: &Vec3) -> Option<Vec3> {
     Some(at)
 }
 
-/// An image that would help.
+/// A recommended additional pair.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Advice {
-    /// Where to hold the target and how, for people.
+    /// Position and orientation of the target, as text.
     pub text: String,
-    /// The marks' error with that pair, as a part of what it is.
+    /// Mark error with that pair, as a fraction of the present error.
     pub factor: f64,
 }
 
-/// The next pair that lowers the marks' error most, among poses of the target all over both images.
+/// The additional pair that reduces the mark error most, among candidate poses over the common view.
 pub fn next_image(
     target: &Target,
     state: &State,
@@ -187,7 +187,7 @@ pub fn next_image(
     let problem = Problem { target, pairs: &[], free: *free };
     let bare = State { left_from_board: Vec::new(), ..state.clone() };
     let better = candidates(target, &state.rig, volume).into_iter().filter_map(|c| {
-        let pair = imagined(target, &bare, &c.pose, typical)?;
+        let pair = simulated(target, &bare, &c.pose, typical)?;
         let added = pair_information(&problem, &bare, noise, &pair, &c.pose)?;
         let with = covariance(&(information + added), free)?;
         Some(Advice { text: c.text, factor: sensitivity.error(&with).rms_m / now })
@@ -200,15 +200,15 @@ struct Candidate {
     text: String,
 }
 
-/// Poses in a coarse grid over the left image, three distances, five tilts.
+/// Candidate poses: a coarse grid over the left image, the two ends of the volume's range, five tilts.
 fn candidates(target: &Target, rig: &Rig, volume: &Volume) -> Vec<Candidate> {
-    let across = ["left", "middle", "right"];
+    let across = ["left", "centre", "right"];
     let down = ["upper", "middle", "lower"];
     let tilts = [
         (Vec3::zeros(), "facing the camera"),
-        (Vec3::new(0.0, 0.7, 0.0), "turned by 40 degrees about the vertical"),
-        (Vec3::new(0.0, -0.7, 0.0), "turned by 40 degrees about the vertical the other way"),
-        (Vec3::new(0.7, 0.0, 0.0), "tilted by 40 degrees, top away"),
+        (Vec3::new(0.0, 0.7, 0.0), "rotated by 40 degrees about the vertical axis"),
+        (Vec3::new(0.0, -0.7, 0.0), "rotated by 40 degrees about the vertical axis in the opposite direction"),
+        (Vec3::new(0.7, 0.0, 0.0), "tilted by 40 degrees, top away from the camera"),
         (Vec3::new(-0.7, 0.0, 0.0), "tilted by 40 degrees, top towards the camera"),
     ];
     let size = target.size();
@@ -234,16 +234,15 @@ fn candidates(target: &Target, rig: &Rig, volume: &Volume) -> Vec<Candidate> {
     out
 }
 
-/// The pair that would be seen there; `None` where less than the whole target (of one with markers, half) is in both
-/// images.
-fn imagined(target: &Target, state: &State, pose: &Pose, typical: &Matrix2<f64>) -> Option<Pair> {
+/// Simulates the pair at a pose; `None` unless the entire target (half of a target with markers) is in both images.
+fn simulated(target: &Target, state: &State, pose: &Pose, typical: &Matrix2<f64>) -> Option<Pair> {
     let view = |v: View| -> Vec<Seen> {
         let camera: &Camera = state.rig.camera(v);
         (0..target.count())
             .filter_map(|index| {
                 let x = pose * nalgebra::Point3::from(state.board_point(target, index));
                 let at = state.rig.project(v, &x.coords)?;
-                camera.contains(at, MARGIN_PX).then_some(Seen { index, at, covariance: *typical })
+                camera.contains(at, MIN_MARGIN_PX).then_some(Seen { index, at, covariance: *typical })
             })
             .collect()
     };

@@ -1,28 +1,28 @@
-//! How good a calibration is on pairs that it was not made from: epipolar distance, lengths of squares and diagonals.
+//! Scores of a calibration on a set of pairs: epipolar distances, errors of the lengths of squares and diagonals.
 
 use super::Pair;
 use crate::calibrate::target::{Seen, Target};
 use graspd_rt::geom::{Pixel, Rig, Vec3};
 use nalgebra::{Matrix3, Matrix4, Vector2, Vector3};
 
-/// Figures of a set of pairs.
+/// Scores of a set of pairs.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Scores {
-    /// Signed distances from the epipolar lines in both images, pixels of the undistorted image.
+    /// Signed distances from the epipolar lines in both undistorted images, pixels.
     pub epipolar_px: Vec<f64>,
-    /// Lengths between neighbouring points against the target's, less 1.
+    /// Relative errors of the distances between neighbouring points.
     pub squares: Vec<f64>,
-    /// Lengths of the target's diagonals against the true ones, less 1.
+    /// Relative errors of the lengths of the target's diagonals.
     pub diagonals: Vec<f64>,
-    /// Points that could have been evaluated: all of the target, or those seen in both images where it may be seen in
-    /// part.
+    /// Number of points expected: all points of the target, or the points detected in both images for a target that may
+    /// be partly visible.
     pub expected: usize,
-    /// Points that were.
+    /// Number of points evaluated.
     pub evaluated: usize,
 }
 
 impl Scores {
-    /// The figures in one line.
+    /// One-line summary.
     pub fn summary(&self) -> String {
         format!(
             "epipolar {:.3} px RMS, {:.3} px P95; squares {:.3} % RMS, {:+.3} % mean; diagonals {:.3} % RMS; {} of {} points evaluated",
@@ -36,7 +36,7 @@ impl Scores {
         )
     }
 
-    /// Adds the figures of another set.
+    /// Adds the scores of another set.
     pub fn extend(&mut self, other: Scores) {
         self.epipolar_px.extend(other.epipolar_px);
         self.squares.extend(other.squares);
@@ -56,11 +56,11 @@ pub fn mean(v: &[f64]) -> f64 {
     v.iter().sum::<f64>() / v.len().max(1) as f64
 }
 
-/// The value that a part of the absolute values does not exceed.
-pub fn quantile(v: &[f64], part: f64) -> f64 {
+/// Quantile of the absolute values at a fraction, with linear interpolation.
+pub fn quantile(v: &[f64], fraction: f64) -> f64 {
     let mut all: Vec<f64> = v.iter().map(|x| x.abs()).collect();
     all.sort_by(f64::total_cmp);
-    let at = part * (all.len().max(1) - 1) as f64;
+    let at = fraction * (all.len().max(1) - 1) as f64;
     let (k, f) = (at.floor() as usize, at.fract());
     let get = |k: usize| all.get(k.min(all.len().saturating_sub(1))).copied().unwrap_or(0.0);
     get(k) * (1.0 - f) + get(k + 1) * f
@@ -70,7 +70,7 @@ pub fn quantile(v: &[f64], part: f64) -> f64 {
 pub fn score(rig: &Rig, target: &Target, pair: &Pair) -> Scores {
     let mut out = Scores::default();
     let f = fundamental(rig);
-    let mut places: Vec<Option<Vec3>> = vec![None; target.count()];
+    let mut points: Vec<Option<Vec3>> = vec![None; target.count()];
     let mut both_seen = 0;
     for (l, r) in both(&pair.seen[0], &pair.seen[1]) {
         both_seen += 1;
@@ -80,14 +80,14 @@ pub fn score(rig: &Rig, target: &Target, pair: &Pair) -> Scores {
         out.epipolar_px.push(e / to_right.xy().norm());
         out.epipolar_px.push(e / to_left.xy().norm());
         out.evaluated += 1;
-        if let Some(place) = places.get_mut(l.index) {
-            *place = triangulate(rig, &f, a, b);
+        if let Some(point) = points.get_mut(l.index) {
+            *point = triangulate(rig, &f, a, b);
         }
     }
     out.expected = if target.has_ids() { both_seen } else { target.count() };
     let at = |c: usize, r: usize| {
         let inside = c < target.cols && r < target.rows;
-        if inside { places.get(target.index(c, r)).copied().flatten() } else { None }
+        if inside { points.get(target.index(c, r)).copied().flatten() } else { None }
     };
     for r in 0..target.rows {
         for c in 0..target.cols {
@@ -106,7 +106,7 @@ pub fn score(rig: &Rig, target: &Target, pair: &Pair) -> Scores {
     out
 }
 
-/// Points that both views see, by index.
+/// Points detected in both views, by index.
 pub fn both<'a>(left: &'a [Seen], right: &'a [Seen]) -> impl Iterator<Item = (&'a Seen, &'a Seen)> {
     left.iter().filter_map(|l| {
         let k = right.binary_search_by_key(&l.index, |s| s.index).ok()?;
@@ -114,7 +114,7 @@ pub fn both<'a>(left: &'a [Seen], right: &'a [Seen]) -> impl Iterator<Item = (&'
     })
 }
 
-/// The pixel without distortion, on the camera's own grid.
+/// The undistorted pixel for the same camera matrix.
 fn straight(c: &graspd_rt::geom::Camera, p: Pixel) -> Option<Pixel> {
     c.undistort(p).map(|n| Pixel::new(n.x * c.fx + c.cx, n.y * c.fy + c.cy))
 }
@@ -132,8 +132,8 @@ fn fundamental(rig: &Rig) -> Matrix3<f64> {
         * k_inverse(&rig.left)
 }
 
-/// A point from two undistorted pixels: both moved onto a common epipolar plane by the least squares of Lindstrom
-/// (2010), then the intersection of their rays.
+/// Triangulates a point from two undistorted pixels: least-squares correction of both pixels onto a common epipolar
+/// plane (Lindstrom 2010), then intersection of their rays.
 fn triangulate(rig: &Rig, f: &Matrix3<f64>, a: Pixel, b: Pixel) -> Option<Vec3> {
     let e2 = f.fixed_view::<2, 2>(0, 0).into_owned();
     let (n0, m0) = ((f * a.push(1.0)).xy(), (f.tr_mul(&b.push(1.0))).xy());
@@ -142,7 +142,7 @@ fn triangulate(rig: &Rig, f: &Matrix3<f64>, a: Pixel, b: Pixel) -> Option<Vec3> 
     for _ in 0..5 {
         let n = (f * x.push(1.0)).xy();
         let m = (f.tr_mul(&y.push(1.0))).xy();
-        // c - 2 lambda half + lambda^2 bend = 0, its smaller root.
+        // The smaller root of c - 2 lambda half + lambda^2 bend = 0.
         let bend = n.dot(&(e2 * m));
         let half = 0.5 * (n.dot(&n0) + m.dot(&m0));
         let lambda = c / (half + (half * half - bend * c).max(0.0).sqrt());
@@ -151,16 +151,16 @@ fn triangulate(rig: &Rig, f: &Matrix3<f64>, a: Pixel, b: Pixel) -> Option<Vec3> 
     intersect(rig, x, y)
 }
 
-/// The homogeneous linear solution, which is exact for rays that meet.
+/// Linear triangulation; exact for rays that intersect.
 fn intersect(rig: &Rig, a: Pixel, b: Pixel) -> Option<Vec3> {
     let ray = |c: &graspd_rt::geom::Camera, p: Pixel| Vector2::new((p.x - c.cx) / c.fx, (p.y - c.cy) / c.fy);
     let (l, r) = (ray(&rig.left, a), ray(&rig.right, b));
     let m: Matrix4<f64> = rig.right_from_left.to_homogeneous();
     let row = |k: usize| m.row(k).transpose();
-    let eye = Matrix4::<f64>::identity();
+    let identity = Matrix4::<f64>::identity();
     let rows = [
-        eye.row(2).transpose() * l.x - eye.row(0).transpose(),
-        eye.row(2).transpose() * l.y - eye.row(1).transpose(),
+        identity.row(2).transpose() * l.x - identity.row(0).transpose(),
+        identity.row(2).transpose() * l.y - identity.row(1).transpose(),
         row(2) * r.x - row(0),
         row(2) * r.y - row(1),
     ];

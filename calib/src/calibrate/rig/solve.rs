@@ -1,41 +1,41 @@
-//! The whole estimate: each camera alone, consensus, joint fit, and the pairs that do not belong, until nothing
-//! changes.
+//! The estimate: a fit of each camera alone, consensus, then joint fit and exclusion of inconsistent pairs, repeated
+//! until the set of pairs does not change.
 
 use super::bundle::{Fit, Problem, fit};
-use super::consensus::{Consensus, NO_RIG_PX, consensus};
+use super::consensus::{Consensus, MAX_MEDIAN_DISAGREEMENT_PX, consensus};
 use super::initial::single_camera;
-use super::pairs::{Judge, LeftOut, Test, blurred, mirrored, test, usual_alone, usual_rise};
+use super::pairs::{LeftOut, PairCriteria, Test, blurred, mirrored, test, usual_alone, usual_rise};
 use super::parameters::{BEND, BENDING, SHARED, State};
-use super::{CalibrateError, LEAST_PAIRS, Pair};
+use super::{CalibrateError, MIN_PAIRS, Pair};
 use crate::calibrate::target::Target;
 use graspd_rt::geom::{Pose, Rig};
 
-/// Rounds in which pairs are left out or taken back.
-const ROUNDS: usize = 30;
+/// Maximum number of rounds in which pairs are excluded or readmitted.
+const MAX_ROUNDS: usize = 30;
 
-/// What is asked.
+/// Image sizes and lens model.
 #[derive(Clone, Copy, Debug)]
 pub struct Lens {
     /// Image sizes, left and right.
     pub sizes: [(u32, u32); 2],
-    /// Estimate k4, k5, k6 as well.
+    /// Whether k4, k5, k6 are estimated.
     pub rational: bool,
 }
 
-/// A solved set.
+/// Result of the estimate.
 #[derive(Clone, Debug)]
 pub struct Solved {
-    /// The fit to the pairs used.
+    /// Fit to the pairs used.
     pub fit: Fit,
-    /// The pairs used, labels as they were taken in the end.
+    /// The pairs used, with their final labels.
     pub used: Vec<Pair>,
     /// Tests of the pairs used.
     pub tests: Vec<Test>,
-    /// The pairs left out, with the reason.
+    /// The excluded pairs, with the reason.
     pub left_out: Vec<LeftOut>,
 }
 
-/// Which shared parameters are estimated.
+/// Whether each shared parameter is estimated.
 pub(super) fn free(rational: bool) -> [bool; SHARED] {
     let mut free = [true; SHARED];
     for camera in 0..2 {
@@ -47,7 +47,7 @@ pub(super) fn free(rational: bool) -> [bool; SHARED] {
 /// Solves a set of pairs.
 ///
 /// # Errors
-/// Too few pairs, or no rig that they agree on.
+/// Too few pairs, no common rig, or a fit that fails.
 pub fn solve(target: &Target, mut pairs: Vec<Pair>, lens: &Lens) -> Result<Solved, CalibrateError> {
     let mut left_out = Vec::new();
     let blur = blurred(&pairs);
@@ -73,7 +73,7 @@ pub fn solve(target: &Target, mut pairs: Vec<Pair>, lens: &Lens) -> Result<Solve
         let at = State { left_from_board: Vec::new(), ..fitted.state.clone() };
         let tests: Vec<Option<Test>> = pairs.iter().map(|p| test(target, &at, &fitted.noise, p)).collect();
         let inside: Vec<Test> = tests.iter().zip(&used).filter(|(_, u)| **u).filter_map(|(t, _)| t.clone()).collect();
-        let judge = Judge {
+        let criteria = PairCriteria {
             target,
             state: &at,
             noise: fitted.noise,
@@ -85,11 +85,11 @@ pub fn solve(target: &Target, mut pairs: Vec<Pair>, lens: &Lens) -> Result<Solve
                 *pose = t.poses[2];
             }
         }
-        let changed = revise(&judge, &mut pairs, &mut used, &tests);
-        if !changed || round + 1 >= ROUNDS {
+        let changed = revise(&criteria, &mut pairs, &mut used, &tests);
+        if !changed || round + 1 >= MAX_ROUNDS {
             for (k, p) in pairs.iter().enumerate() {
                 if !used[k] {
-                    left_out.push(judge.reason(p, tests[k].as_ref(), &pairs));
+                    left_out.push(criteria.reason(p, tests[k].as_ref(), &pairs));
                 }
             }
             let kept = pairs.iter().zip(&used).filter(|(_, u)| **u).map(|(p, _)| p.clone()).collect();
@@ -102,31 +102,32 @@ pub fn solve(target: &Target, mut pairs: Vec<Pair>, lens: &Lens) -> Result<Solve
 }
 
 fn enough(count: usize) -> Result<(), CalibrateError> {
-    if count < LEAST_PAIRS { Err(CalibrateError::TooFew { found: count }) } else { Ok(()) }
+    if count < MIN_PAIRS { Err(CalibrateError::TooFew { found: count }) } else { Ok(()) }
 }
 
-/// Leaves out the worst pair that is wrong, takes back those that are good; whether anything changed. One at a time,
-/// since a wrong pair in the fit makes good ones look wrong.
-fn revise(judge: &Judge<'_>, pairs: &mut [Pair], used: &mut [bool], tests: &[Option<Test>]) -> bool {
+/// Excludes the worst inconsistent pair and readmits consistent ones; returns whether anything changed. Pairs are
+/// excluded one at a time, since an inconsistent pair in the fit makes consistent pairs fail the test.
+fn revise(criteria: &PairCriteria<'_>, pairs: &mut [Pair], used: &mut [bool], tests: &[Option<Test>]) -> bool {
     let mut changed = false;
     for k in 0..pairs.len() {
         if used[k] {
             continue;
         }
-        if tests[k].as_ref().is_some_and(|t| judge.good(t)) {
+        if tests[k].as_ref().is_some_and(|t| criteria.consistent(t)) {
             used[k] = true;
             changed = true;
-        } else if let Some(p) = judge.turned(&pairs[k]) {
+        } else if let Some(p) = criteria.relabelled(&pairs[k]) {
             pairs[k] = p;
             used[k] = true;
             changed = true;
         }
     }
     let badness = |t: &Option<Test>| {
-        t.as_ref().map_or(f64::MAX, |t| (t.rise / judge.usual).max(t.alone[0].max(t.alone[1]) / judge.usual_alone))
+        t.as_ref()
+            .map_or(f64::MAX, |t| (t.rise / criteria.usual).max(t.alone[0].max(t.alone[1]) / criteria.usual_alone))
     };
     let worst = (0..pairs.len())
-        .filter(|k| used[*k] && !tests[*k].as_ref().is_some_and(|t| judge.good(t)))
+        .filter(|k| used[*k] && !tests[*k].as_ref().is_some_and(|t| criteria.consistent(t)))
         .max_by(|a, b| badness(&tests[*a]).total_cmp(&badness(&tests[*b])));
     if let Some(k) = worst {
         used[k] = false;
@@ -135,7 +136,7 @@ fn revise(judge: &Judge<'_>, pairs: &mut [Pair], used: &mut [bool], tests: &[Opt
     changed
 }
 
-/// The joint fit of the pairs in use.
+/// Joint fit of the pairs in use.
 fn joint(
     target: &Target,
     pairs: &[Pair],
@@ -150,9 +151,9 @@ fn joint(
     fit(&Problem { target, pairs: &chosen, free }, state).ok_or(CalibrateError::NoFit)
 }
 
-/// Gives the right views the direction of the left ones, where the board looks the same when it is turned.
+/// Rotates the labels of the right views to the orientation of the left views, for boards with a rotational symmetry.
 pub(super) fn align(target: &Target, pairs: &mut [Pair]) {
-    let turns = target.turns();
+    let rotations = target.rotations();
     for p in pairs {
         let [left, right] = &mut p.seen;
         let score = |map: &[usize]| -> f64 {
@@ -164,7 +165,7 @@ pub(super) fn align(target: &Target, pairs: &mut [Pair]) {
                 .fold((nalgebra::Vector2::zeros(), nalgebra::Vector2::zeros()), |m, (a, b)| (m.0 + a / n, m.1 + b / n));
             both.iter().map(|(x, y)| (x - a).dot(&(y - b))).sum()
         };
-        let best = turns.iter().max_by(|x, y| score(x).total_cmp(&score(y)));
+        let best = rotations.iter().max_by(|x, y| score(x).total_cmp(&score(y)));
         if let Some(map) = best {
             for s in right.iter_mut() {
                 s.index = map.get(s.index).copied().unwrap_or(s.index);
@@ -174,14 +175,14 @@ pub(super) fn align(target: &Target, pairs: &mut [Pair]) {
     }
 }
 
-/// Each camera alone, then what most pairs agree on.
+/// Start values: each camera alone, then the consensus of the pairs.
 fn start(target: &Target, pairs: &[Pair], lens: &Lens) -> Result<(State, Vec<bool>), CalibrateError> {
     let (left, right) = cameras(target, pairs, lens)?;
     let agreed = |pairs: &[Pair], right: &Fit| {
         consensus(target, &right.state.rig.left, pairs, &left.state.left_from_board, &right.state.left_from_board)
     };
     let found = agreed(pairs, &right).ok_or(CalibrateError::NoFit)?;
-    if !(found.median_px < NO_RIG_PX) {
+    if !(found.median_px < MAX_MEDIAN_DISAGREEMENT_PX) {
         return Err(CalibrateError::NoCommonRig {
             median_px: found.median_px,
             guess: guess(target, pairs, lens, &left, &right),
@@ -194,7 +195,7 @@ fn start(target: &Target, pairs: &[Pair], lens: &Lens) -> Result<(State, Vec<boo
     Ok((state, agree))
 }
 
-/// Fits of each camera alone; the right one's views are given as left ones.
+/// Fits each camera alone; the views of the right camera are passed as left views.
 fn cameras(target: &Target, pairs: &[Pair], lens: &Lens) -> Result<(Fit, Fit), CalibrateError> {
     let alone = |v: usize| {
         let views: Vec<Pair> =
@@ -207,7 +208,8 @@ fn cameras(target: &Target, pairs: &[Pair], lens: &Lens) -> Result<(Fit, Fit), C
     ))
 }
 
-/// What would make the pairs agree: another order of the right images, or mirrored images.
+/// Searches for a change of the input under which the pairs agree: a different order of the right images, or mirrored
+/// images.
 fn guess(target: &Target, pairs: &[Pair], lens: &Lens, left: &Fit, right: &Fit) -> Option<&'static str> {
     let n = pairs.len();
     let reorder = |f: &dyn Fn(usize) -> usize| -> f64 {
@@ -220,29 +222,32 @@ fn guess(target: &Target, pairs: &[Pair], lens: &Lens, left: &Fit, right: &Fit) 
     };
     let orders: [(&'static str, &dyn Fn(usize) -> usize); 3] = [
         (
-            "the right images fit when each is paired with the left image after it: one camera has an extra or a missing image",
+            "they agree if each right image is paired with the next left image: one camera has an extra or a missing image",
             &|k| (k + n - 1) % n,
         ),
         (
-            "the right images fit when each is paired with the left image before it: one camera has an extra or a missing image",
+            "they agree if each right image is paired with the previous left image: one camera has an extra or a missing image",
             &|k| (k + 1) % n,
         ),
-        ("the right images fit in the opposite order: name them so that left and right sort alike", &|k| n - 1 - k),
+        (
+            "they agree if the right images are in the reverse order: name the files so that left and right sort in the same order",
+            &|k| n - 1 - k,
+        ),
     ];
-    if let Some((text, _)) = orders.iter().find(|(_, f)| reorder(f) < NO_RIG_PX) {
+    if let Some((text, _)) = orders.iter().find(|(_, f)| reorder(f) < MAX_MEDIAN_DISAGREEMENT_PX) {
         return Some(text);
     }
     let rig = Rig { left: left.state.rig.left, right: right.state.rig.left, right_from_left: Pose::identity() };
     let state = State { rig, bend: [0.0; BEND], left_from_board: Vec::new() };
     for (views, text) in [
-        ([false, true], "they fit when the right images are mirrored: save images as the camera delivers them"),
-        ([true, false], "they fit when the left images are mirrored: save images as the camera delivers them"),
+        ([false, true], "they agree if the right images are mirrored: save images as the camera delivers them"),
+        ([true, false], "they agree if the left images are mirrored: save images as the camera delivers them"),
     ] {
         let mut flipped: Vec<Pair> = pairs.iter().map(|p| mirrored(target, &state, p, views)).collect();
         align(target, &mut flipped);
         if let Ok((l, r)) = cameras(target, &flipped, lens)
             && consensus(target, &r.state.rig.left, &flipped, &l.state.left_from_board, &r.state.left_from_board)
-                .is_some_and(|c| c.median_px < NO_RIG_PX)
+                .is_some_and(|c| c.median_px < MAX_MEDIAN_DISAGREEMENT_PX)
         {
             return Some(text);
         }
@@ -250,14 +255,14 @@ fn guess(target: &Target, pairs: &[Pair], lens: &Lens, left: &Fit, right: &Fit) 
     None
 }
 
-/// Bending of the board: largest distance from its plane, metres.
+/// Bending of the board: half of its depth range, metres.
 pub fn bending_m(target: &Target, state: &State) -> f64 {
     let z = |k: usize| state.board_point(target, k).z;
     let all = (0..target.count()).map(z);
     0.5 * (all.clone().fold(f64::MIN, f64::max) - all.fold(f64::MAX, f64::min))
 }
 
-/// Standard deviation of a bending term, metres.
+/// Standard deviation of the bending, metres.
 pub fn bending_sigma_m(fit: &Fit) -> f64 {
     (0..BEND).map(|k| fit.covariance[(BENDING + k, BENDING + k)].max(0.0)).sum::<f64>().sqrt()
 }

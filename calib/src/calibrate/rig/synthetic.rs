@@ -1,4 +1,4 @@
-//! Rigs with known truth for tests: random poses of a board, seeded noise, and pairs that are wrong on purpose.
+//! Test data with ground truth: a rig, random poses of a board, and pairs with seeded noise.
 
 use super::Pair;
 use super::parameters::{State, project};
@@ -9,10 +9,10 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-/// Noise of every coordinate, pixels.
+/// Standard deviation of the noise per coordinate, pixels.
 pub(crate) const NOISE_PX: f64 = 0.1;
 
-/// A rig such as small stereo heads are, and a chessboard.
+/// A rig with the parameters of a small stereo head, and a chessboard.
 pub(crate) fn truth() -> (Rig, Target) {
     let d = Distortion { k1: -0.28, k2: 0.09, p1: 1e-3, p2: -4e-4, k3: -0.01, ..Default::default() };
     let left = Camera { width: 640, height: 480, fx: 534.0, fy: 533.0, cx: 341.0, cy: 235.0, distortion: d };
@@ -21,7 +21,7 @@ pub(crate) fn truth() -> (Rig, Target) {
     (Rig { left, right, right_from_left }, Target::parse("chessboard:9x6:0.025").unwrap())
 }
 
-/// A random pose with the whole board in both images.
+/// A random pose with the entire board in both images.
 pub(crate) fn pose(rng: &mut ChaCha8Rng, rig: &Rig, target: &Target) -> Pose {
     loop {
         let z = rng.random_range(0.28..0.55);
@@ -41,7 +41,7 @@ pub(crate) fn pose(rng: &mut ChaCha8Rng, rig: &Rig, target: &Target) -> Pose {
     }
 }
 
-/// Both views of a board; `right_pose` is where it stood when the right image was taken.
+/// Both views of a board; `right_pose` is the pose of the board when the right image was taken.
 pub(crate) fn pair(
     rng: &mut ChaCha8Rng,
     rig: &Rig,
@@ -57,7 +57,7 @@ pub(crate) fn pair(
             .map(|index| {
                 let noise: [f64; 2] = [0, 1].map(|_| StandardNormal.sample(rng));
                 let p = project(&state, target, at, view, index).unwrap().at;
-                // The detector's own covariance is wrong by a factor, as it is in life.
+                // The covariance of a real detector is also wrong by a factor.
                 let covariance = Matrix2::identity() * (0.25 * NOISE_PX * NOISE_PX);
                 Seen { index, at: p + Vector2::from(noise) * NOISE_PX, covariance }
             })
@@ -66,7 +66,7 @@ pub(crate) fn pair(
     Pair { name: format!("pair{name:02}"), seen, blur_px: [1.0; 2] }
 }
 
-/// A good set.
+/// A set of consistent pairs.
 pub(crate) fn set(rng: &mut ChaCha8Rng, rig: &Rig, target: &Target, count: usize) -> Vec<Pair> {
     (0..count)
         .map(|k| {

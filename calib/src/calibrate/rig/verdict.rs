@@ -1,34 +1,34 @@
-//! One verdict in words: what the calibration means for a mark.
+//! The verdict: the effect of the calibration's uncertainty on a mark, compared with the tolerance.
 
 use super::pairs::LeftOut;
 use super::predict::MarkError;
 
-/// Part of the tolerance that the calibration may use up before it is called good: a third leaves room for marks and
+/// Maximum fraction of the tolerance that a good calibration uses: one third leaves room for the errors of marks and
 /// arm.
-const GOOD_PART: f64 = 1.0 / 3.0;
-/// Factor from one standard deviation of a length in space to what 95 % of the errors stay below: between 1.6 for an
-/// error in all directions and 1.96 for one along the line of sight, which is what a stereo rig has.
-const P95: f64 = 1.96;
-/// Groups of pairs that disagree this many times more than the noise says tell of something that the model leaves out.
-/// Of four groups with nothing but noise, one set in a thousand disagrees by more.
-const MODEL_GAP: f64 = 2.3;
-/// An image that lowers the error by less than this part is not worth taking.
-const WORTH: f64 = 0.03;
+const MAX_GOOD_FRACTION: f64 = 1.0 / 3.0;
+/// 95 % quantile of the length of a position error, in standard deviations of that length: 1.6 for an isotropic error,
+/// 1.96 for an error along one direction. The error of a stereo rig is along the line of sight.
+const P95_SIGMAS: f64 = 1.96;
+/// Maximum ratio of the jackknife error to the error from the covariance. A larger ratio shows an effect that the model
+/// omits. With four groups and noise only, one set in a thousand exceeds it.
+const MAX_JACKKNIFE_RATIO: f64 = 2.3;
+/// Minimum relative reduction of the error for which another image is recommended.
+const MIN_GAIN: f64 = 0.03;
 
-/// How good it is.
+/// Grade of a calibration.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Grade {
-    /// Uses a third of the tolerance at most.
+    /// Uses at most one third of the tolerance.
     Good,
     /// Within the tolerance.
     Usable,
-    /// Beyond it.
+    /// Exceeds the tolerance.
     Poor,
 }
 
 impl Grade {
-    /// The word.
-    pub fn word(self) -> &'static str {
+    /// Name in messages and JSON.
+    pub fn name(self) -> &'static str {
         match self {
             Grade::Good => "good",
             Grade::Usable => "usable",
@@ -40,51 +40,51 @@ impl Grade {
 /// The verdict.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Verdict {
-    /// How good.
+    /// Grade.
     pub grade: Grade,
-    /// Predicted error of a mark that 95 % stay below, metres.
+    /// Predicted 95 % quantile of the position error of a mark, metres.
     pub mark_p95_m: f64,
-    /// One sentence.
+    /// Message.
     pub text: String,
-    /// What to look at.
+    /// Warnings.
     pub warnings: Vec<String>,
-    /// Whether more images would help.
+    /// Whether more images are recommended.
     pub more_helps: bool,
 }
 
-/// What a verdict is made from.
+/// Inputs of the verdict.
 pub struct Facts<'a> {
-    /// From the covariance.
+    /// Mark error from the covariance.
     pub predicted: MarkError,
-    /// From leaving groups out, one standard deviation, metres.
+    /// Mark error from the jackknife over groups, one standard deviation, metres.
     pub jackknife_m: f64,
-    /// Distances, metres.
+    /// Range of distances of the marks, metres.
     pub range_m: [f64; 2],
     /// Epipolar RMS of held-out pairs, pixels.
     pub holdout_epipolar_px: f64,
-    /// What the task tolerates, metres.
+    /// Position error of a mark that the task tolerates, metres.
     pub tolerance_m: f64,
-    /// Error with the best further image, as a part.
+    /// Mark error with the best additional pair, as a fraction of the present error.
     pub next_factor: Option<f64>,
-    /// Pairs left out, and pairs of files.
+    /// Excluded pairs.
     pub left_out: &'a [LeftOut],
     /// Number of pairs used.
     pub used: usize,
-    /// How far the board is bent, and one standard deviation of that, metres.
+    /// Bending of the board and its standard deviation, metres.
     pub bending_m: [f64; 2],
-    /// Gaps of the coverage.
+    /// Messages about missing coverage.
     pub gaps: Vec<String>,
-    /// Signed translation of the right camera in the left one's frame, x, and the baseline, metres.
+    /// x coordinate of the right camera's centre in the left camera's frame, metres.
     pub right_centre_x_m: f64,
     /// Baseline, metres.
     pub baseline_m: f64,
 }
 
-/// Judges.
+/// Computes the verdict.
 pub fn verdict(f: &Facts<'_>) -> Verdict {
     let sigma = f.predicted.rms_m.max(f.jackknife_m);
-    let p95 = P95 * sigma;
-    let grade = if p95 <= GOOD_PART * f.tolerance_m {
+    let p95 = P95_SIGMAS * sigma;
+    let grade = if p95 <= MAX_GOOD_FRACTION * f.tolerance_m {
         Grade::Good
     } else if p95 <= f.tolerance_m {
         Grade::Usable
@@ -92,47 +92,47 @@ pub fn verdict(f: &Facts<'_>) -> Verdict {
         Grade::Poor
     };
     let meaning = match grade {
-        Grade::Good => "well within",
+        Grade::Good => "at most a third of",
         Grade::Usable => "within",
-        Grade::Poor => "not within",
+        Grade::Poor => "above",
     };
     let text = format!(
-        "{}: a mark {:.2} to {:.2} m away is off by less than {:.2} mm (95 %) and {:.2} px from its epipolar line by the calibration alone, {meaning} the tolerance of {:.2} mm",
-        grade.word(),
+        "{}: the calibration alone causes a position error of up to {:.2} mm (95 %) for a mark at {:.2} to {:.2} m, {meaning} the tolerance of {:.2} mm, and a distance of {:.2} px from the epipolar line",
+        grade.name(),
+        p95 * 1e3,
         f.range_m[0],
         f.range_m[1],
-        p95 * 1e3,
-        P95 * f.predicted.epipolar_px,
         f.tolerance_m * 1e3,
+        P95_SIGMAS * f.predicted.epipolar_px,
     );
-    let more_helps = grade != Grade::Good || f.next_factor.is_some_and(|n| n < 1.0 - WORTH);
+    let more_helps = grade != Grade::Good || f.next_factor.is_some_and(|n| n < 1.0 - MIN_GAIN);
     Verdict { grade, mark_p95_m: p95, text, warnings: warnings(f), more_helps }
 }
 
 fn warnings(f: &Facts<'_>) -> Vec<String> {
     let mut out = Vec::new();
-    if f.jackknife_m > MODEL_GAP * f.predicted.rms_m {
+    if f.jackknife_m > MAX_JACKKNIFE_RATIO * f.predicted.rms_m {
         out.push(format!(
-            "groups of pairs disagree by {:.2} mm where noise explains {:.2} mm: the lens model, the board's flatness or the cameras' mounting does not hold; try --lens rational, a stiffer board, and check the mounting",
+            "groups of pairs disagree by {:.2} mm, but noise explains only {:.2} mm: the lens model is insufficient, the board is not flat, or the camera mounting is loose; try --lens rational or a stiffer board, and check the mounting",
             f.jackknife_m * 1e3,
             f.predicted.rms_m * 1e3
         ));
     }
     if f.bending_m[0] > 3.0 * f.bending_m[1] && f.bending_m[0] > 2e-4 {
         out.push(format!(
-            "the board is bent by {:.2} mm; the fit takes that into account, a flat board is better",
+            "the board is bent by {:.2} mm; the fit models the bending, but a flat board is better",
             f.bending_m[0] * 1e3
         ));
     }
     if 3 * f.left_out.len() > f.used + f.left_out.len() {
         out.push(format!(
-            "{} of {} pairs were left out: look at their reasons before trusting the rest",
+            "{} of {} pairs were left out: check the reasons before using this calibration",
             f.left_out.len(),
             f.used + f.left_out.len()
         ));
     }
     if f.right_centre_x_m < -0.5 * f.baseline_m {
-        out.push("the camera called right stands to the left of the one called left: swap --left and --right, unless the cameras hang upside down".to_owned());
+        out.push("the right camera is to the left of the left camera: swap --left and --right, unless the cameras are mounted upside down".to_owned());
     }
     out.extend(f.gaps.iter().cloned());
     out
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn the_grade_follows_the_tolerance_and_the_larger_of_two_errors() {
+    fn the_grade_depends_on_the_tolerance_and_the_larger_error() {
         let v = verdict(&facts());
         assert_eq!((v.grade, v.more_helps, v.warnings.len()), (Grade::Good, false, 0));
         assert_eq!(verdict(&Facts { tolerance_m: 1e-3, ..facts() }).grade, Grade::Usable);

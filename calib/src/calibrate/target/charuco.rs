@@ -1,4 +1,4 @@
-//! A ChArUco board: labels by its markers, every corner measured anew.
+//! ChArUco board: labels from the markers, corners refined by [`saddle`].
 
 use super::GreyImage;
 use super::chessboard::steps;
@@ -8,7 +8,7 @@ use calib_targets_charuco::{CharucoBoardSpec, CharucoDetector, CharucoParams, Gr
 use graspd_rt::geom::Pixel;
 use std::collections::BTreeMap;
 
-/// Finds the board, or the part of it that is in the image.
+/// Detects the board, or the part of it that is in the image.
 pub(super) fn find(image: &GreyImage, target: &Target) -> Result<Found, NotFound> {
     let nothing = NotFound::Nothing("ChArUco board with markers of that dictionary");
     let Kind::Charuco { marker, dictionary } = target.kind else { return Err(nothing) };
@@ -27,11 +27,11 @@ pub(super) fn find(image: &GreyImage, target: &Target) -> Result<Found, NotFound
         .iter()
         .filter_map(|c| {
             let id = c.id as usize;
-            let place = ((id % target.cols) as i32, (id / target.cols) as i32);
-            (id < target.count()).then(|| (place, Pixel::new(f64::from(c.position.x), f64::from(c.position.y))))
+            let cell = ((id % target.cols) as i32, (id / target.cols) as i32);
+            (id < target.count()).then(|| (cell, Pixel::new(f64::from(c.position.x), f64::from(c.position.y))))
         })
         .collect();
-    // The white margin around a marker is all that is plain.
+    // Only the white margin around a marker is uniform.
     let reach = 0.5 * (1.0 - marker);
     let mut blurs = Vec::new();
     let mut points = Vec::new();

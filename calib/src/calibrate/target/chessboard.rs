@@ -1,5 +1,5 @@
-//! A chessboard: the grid by a topological detector, every corner measured anew, labels by the board's size and
-//! colours.
+//! Chessboard: the grid from a topological detector, corners refined by [`saddle`], labels from the size and the
+//! colours of the board.
 
 use super::GreyImage;
 use super::saddle::{self, Saddle};
@@ -12,28 +12,29 @@ use graspd_rt::geom::Pixel;
 use nalgebra::Vector2;
 use std::collections::BTreeMap;
 
-/// How far the plain squares reach around a corner, in squares: to the next corner, less its blur.
-const REACH: f64 = 0.45;
-/// Part of a row or column of corners that must be measured before it counts as a row of the board: clutter beside a
-/// board has one or two corners that fit, a row that was only overlooked has nearly all.
-const ROW_PART: f64 = 0.6;
-/// Images are searched at full, half and quarter size: a blurred corner is a sharp one of a smaller image.
-const LEVELS: usize = 3;
+/// Extent of the uniform squares around a corner, in squares; clear of the blurred edges through the next corner.
+const REACH_SQUARES: f64 = 0.45;
+/// Minimum fraction of measured corners in a row or column of the board. Clutter next to a board has one or two corners
+/// that fit; a row that the detector missed has nearly all.
+const MIN_ROW_FRACTION: f64 = 0.6;
+/// Number of image sizes searched: full, half and quarter. A corner that is blurred at full size is sharp in a smaller
+/// image.
+const PYRAMID_LEVELS: usize = 3;
 
 type Grid = BTreeMap<(i32, i32), Saddle>;
-/// Corners that were measured outside a grid, with their labels.
+/// Corners measured outside a grid, with their labels.
 type Row = Vec<((i32, i32), Saddle)>;
 
-/// Finds the chessboard.
+/// Detects the chessboard.
 pub(super) fn find(image: &GreyImage, target: &Target) -> Result<Found, NotFound> {
     let mut best = Err(NotFound::Nothing("chessboard"));
     let mut small: Option<GreyImage> = None;
-    for level in 0..LEVELS {
+    for level in 0..PYRAMID_LEVELS {
         let scale = f64::from(1_u32 << level);
         let search = small.as_ref().unwrap_or(image);
         match labelled(image, search, scale, target) {
             Ok(found) => return Ok(found),
-            // What the finest level says of a board that does not fit is closest to what the user sees.
+            // Report the size mismatch of the finest level: it is closest to what the user sees.
             Err(e) if matches!(best, Err(NotFound::Nothing(_))) => best = Err(e),
             Err(_) => {}
         }
@@ -51,7 +52,7 @@ fn labelled(image: &GreyImage, search: &GreyImage, scale: f64, target: &Target) 
     let mut grid = Grid::new();
     for (&(u, v), &at) in &rough {
         if let Some((along, across)) = steps(&|u, v| rough.get(&(u, v)).copied(), u, v)
-            && let Some(s) = saddle::measure(image, at, along, across, REACH)
+            && let Some(s) = saddle::measure(image, at, along, across, REACH_SQUARES)
         {
             grid.insert((u, v), s);
         }
@@ -63,7 +64,7 @@ fn labelled(image: &GreyImage, search: &GreyImage, scale: f64, target: &Target) 
     assemble(grid, target)
 }
 
-/// Corners with grid labels, as the detector finds them, in pixels of the full image.
+/// Detected corners with grid labels, in pixels of the full image.
 fn rough_grid(search: &GreyImage, scale: f64) -> Option<BTreeMap<(i32, i32), Pixel>> {
     let view = GrayImageView { width: search.width(), height: search.height(), data: search.data() };
     let corners = detect_corners(&view, &default_chess_config());
@@ -73,7 +74,7 @@ fn rough_grid(search: &GreyImage, scale: f64) -> Option<BTreeMap<(i32, i32), Pix
     Some(found.corners.iter().map(|c| ((c.grid.u, c.grid.v), Pixel::new(at(c.position.x), at(c.position.y)))).collect())
 }
 
-/// The steps to the next corners along u and v, from whatever neighbours there are.
+/// The steps to the next corners along u and v, from the available neighbours.
 pub(super) fn steps(at: &dyn Fn(i32, i32) -> Option<Pixel>, u: i32, v: i32) -> Option<(Vector2<f64>, Vector2<f64>)> {
     let here = at(u, v)?;
     let one = |before: Option<Pixel>, after: Option<Pixel>| match (before, after) {
@@ -85,7 +86,7 @@ pub(super) fn steps(at: &dyn Fn(i32, i32) -> Option<Pixel>, u: i32, v: i32) -> O
     Some((one(at(u - 1, v), at(u + 1, v))?, one(at(u, v - 1), at(u, v + 1))?))
 }
 
-/// Measures corners that are missing between measured ones.
+/// Measures missing corners between measured ones.
 fn fill(image: &GreyImage, grid: &mut Grid) {
     let Some((u0, u1, v0, v1)) = extent(grid) else { return };
     for v in v0..=v1 {
@@ -99,7 +100,7 @@ fn fill(image: &GreyImage, grid: &mut Grid) {
     }
 }
 
-/// A corner between two measured ones of its row or column.
+/// Measures a corner between two measured ones of its row or column.
 fn between(image: &GreyImage, grid: &Grid, u: i32, v: i32) -> Option<Saddle> {
     let at = |u: i32, v: i32| grid.get(&(u, v)).map(|s| s.at);
     let middle = match (at(u - 1, v), at(u + 1, v), at(u, v - 1), at(u, v + 1)) {
@@ -108,7 +109,7 @@ fn between(image: &GreyImage, grid: &Grid, u: i32, v: i32) -> Option<Saddle> {
     };
     let with = |i: i32, j: i32| if (i, j) == (u, v) { Some(middle) } else { at(i, j) };
     let (along, across) = steps(&with, u, v)?;
-    saddle::measure(image, middle, along, across, REACH)
+    saddle::measure(image, middle, along, across, REACH_SQUARES)
 }
 
 fn extent(grid: &Grid) -> Option<(i32, i32, i32, i32)> {
@@ -117,7 +118,7 @@ fn extent(grid: &Grid) -> Option<(i32, i32, i32, i32)> {
     Some((us.clone().min()?, us.max()?, vs.clone().min()?, vs.max()?))
 }
 
-/// Colours alternate; whatever does not is no corner of the board.
+/// Removes corners that break the alternation of the colours; they are not on the board.
 fn drop_wrong_colours(grid: &mut Grid) {
     let even = |k: &(i32, i32), s: &Saddle| s.light == ((k.0 + k.1).rem_euclid(2) == 0);
     let agree = grid.iter().filter(|(k, s)| even(k, s)).count();
@@ -125,7 +126,7 @@ fn drop_wrong_colours(grid: &mut Grid) {
     grid.retain(|k, s| even(k, s) == keep);
 }
 
-/// One of the four sides of a grid: the corners of a row or column, outside or inside.
+/// Labels along one of the four sides of a grid, `outward` steps outside it, and the outward direction.
 fn side(e: (i32, i32, i32, i32), which: usize, outward: i32) -> (Vec<(i32, i32)>, (i32, i32)) {
     let (u0, u1, v0, v1) = e;
     match which {
@@ -136,7 +137,7 @@ fn side(e: (i32, i32, i32, i32), which: usize, outward: i32) -> (Vec<(i32, i32)>
     }
 }
 
-/// Takes away outer rows that are hardly there, while the grid is larger than the target.
+/// Removes sparse outer rows while the grid is larger than the target.
 fn trim(grid: &mut Grid, target: &Target) {
     let larger = |e: (i32, i32, i32, i32)| {
         let (w, h) = ((e.1 - e.0 + 1) as usize, (e.3 - e.2 + 1) as usize);
@@ -147,14 +148,14 @@ fn trim(grid: &mut Grid, target: &Target) {
     {
         let sparse = (0..4).map(|k| side(e, k, 0).0).find(|row| {
             let there = row.iter().filter(|k| grid.contains_key(k)).count();
-            (there as f64) < ROW_PART * row.len() as f64
+            (there as f64) < MIN_ROW_FRACTION * row.len() as f64
         });
         let Some(row) = sparse else { return };
         grid.retain(|k, _| !row.contains(k));
     }
 }
 
-/// Adds outer rows that the detector overlooked, while the grid is smaller than the target.
+/// Adds outer rows that the detector missed while the grid is smaller than the target.
 fn grow(image: &GreyImage, grid: &mut Grid, target: &Target) {
     let (long, short) = (target.cols.max(target.rows), target.cols.min(target.rows));
     for _ in 0..long + short {
@@ -169,7 +170,7 @@ fn grow(image: &GreyImage, grid: &mut Grid, target: &Target) {
         });
         let best = rows
             .map(|k| outer_row(image, grid, e, k))
-            .filter(|(row, of)| row.len() as f64 >= ROW_PART * *of as f64)
+            .filter(|(row, of)| row.len() as f64 >= MIN_ROW_FRACTION * *of as f64)
             .max_by_key(|(row, _)| row.len());
         let Some((row, _)) = best else { return };
         grid.extend(row);
@@ -177,31 +178,32 @@ fn grow(image: &GreyImage, grid: &mut Grid, target: &Target) {
     }
 }
 
-/// The corners of the next row outside, as far as they can be measured and have the right colours; and how many there
-/// should be.
+/// The corners of the next row outside that can be measured and have the expected colours, and the number of corners in
+/// a complete row.
 fn outer_row(image: &GreyImage, grid: &Grid, e: (i32, i32, i32, i32), which: usize) -> (Row, usize) {
     let (row, (du, dv)) = side(e, which, 1);
     let of = row.len();
     let at = |u: i32, v: i32| grid.get(&(u, v));
     let found = row.into_iter().filter_map(|(u, v)| {
         let (a, b) = (at(u - du, v - dv)?, at(u - 2 * du, v - 2 * dv)?);
-        // Steps shrink or grow by perspective: the next one continues their change.
+        // Perspective changes the step along the row: extrapolate the change.
         let guess = match at(u - 3 * du, v - 3 * dv) {
             Some(c) => a.at * 3.0 - b.at * 3.0 + c.at,
             None => a.at * 2.0 - b.at,
         };
-        let beside = at(u - du + dv, v - dv + du).map(|s| s.at - a.at);
-        let beside = beside.or_else(|| at(u - du - dv, v - dv - du).map(|s| a.at - s.at))?;
+        let sideways = at(u - du + dv, v - dv + du).map(|s| s.at - a.at);
+        let sideways = sideways.or_else(|| at(u - du - dv, v - dv - du).map(|s| a.at - s.at))?;
         let outward = guess - a.at;
         let (along, across) =
-            if du != 0 { (outward * f64::from(du), beside) } else { (beside, outward * f64::from(dv)) };
-        let s = saddle::measure(image, guess, along, across, REACH)?;
+            if du != 0 { (outward * f64::from(du), sideways) } else { (sideways, outward * f64::from(dv)) };
+        let s = saddle::measure(image, guess, along, across, REACH_SQUARES)?;
         (s.light != a.light).then_some(((u, v), s))
     });
     (found.collect(), of)
 }
 
-/// Labels: the board's size says which way it lies, its colours which way up, where they tell.
+/// Assigns labels: the size of the board determines its orientation up to the rotations of the grid onto itself, which
+/// the colours resolve unless they have the same symmetry.
 fn assemble(grid: Grid, target: &Target) -> Result<Found, NotFound> {
     let Some((u0, u1, v0, v1)) = extent(&grid) else { return Err(NotFound::Nothing("chessboard")) };
     let (w, h) = ((u1 - u0 + 1) as usize, (v1 - v0 + 1) as usize);
@@ -217,27 +219,28 @@ fn assemble(grid: Grid, target: &Target) -> Result<Found, NotFound> {
         .into_iter()
         .map(|((u, v), s)| {
             let (u, v) = ((u - u0) as usize, (v - v0) as usize);
-            // A quarter turn keeps the handedness, and looks at the square beside.
+            // A quarter turn preserves the handedness; `light` then refers to the adjacent square.
             let (c, r, light) = if upright { (u, v, s.light) } else { (v, w - 1 - u, !s.light) };
             light_first += if light == ((c + r) % 2 == 0) { 1 } else { -1 };
             Seen { index: target.index(c, r), at: s.at, covariance: s.covariance }
         })
         .collect();
     if light_first > 0 {
-        turn_to_colours(&mut points, target);
+        rotate_to_colours(&mut points, target);
     }
     points.sort_by_key(|p| p.index);
     Ok(Found { points, blur_px })
 }
 
-/// Turns the labels so that the square inside the first corner is dark, where a turn of the board changes that.
-fn turn_to_colours(points: &mut [Seen], target: &Target) {
+/// Rotates the labels so that the square inside the first corner is dark, if a rotation of the board changes its
+/// colour.
+fn rotate_to_colours(points: &mut [Seen], target: &Target) {
     let (n, m) = (target.cols, target.rows);
-    let turns = target.turns();
+    let rotations = target.rotations();
     let map = if (n + m) % 2 == 1 {
-        turns.get(1)
+        rotations.get(1)
     } else if n == m && n % 2 == 0 {
-        turns.get(2)
+        rotations.get(2)
     } else {
         None
     };

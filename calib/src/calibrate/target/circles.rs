@@ -1,7 +1,8 @@
-//! A grid of dark discs: blobs by a local threshold, centroids of their darkness, labels by walking from disc to disc.
+//! Grid of dark discs: blobs by a local threshold, intensity-weighted centroids, labels by region growing over the
+//! grid.
 //!
-//! The centroid is that of the disc's image. It is not the image of the disc's centre; the bundle, which knows pose and
-//! lens, predicts the centroid and so removes the difference.
+//! The result is the centroid of the disc's image, not the image of the disc's centre. The bundle predicts the centroid
+//! from pose and lens, which removes the difference.
 
 use super::GreyImage;
 use super::spec::Target;
@@ -10,15 +11,15 @@ use graspd_rt::geom::Pixel;
 use nalgebra::{Matrix2, Vector2};
 use std::collections::{BTreeMap, VecDeque};
 
-/// Grey levels below the local mean from which a pixel is dark; camera noise is 1 to 4.
-const DARKER: f64 = 10.0;
-/// Pixels of the smallest disc: below, its centroid is worse than a tenth of a pixel.
-const LEAST_AREA: usize = 20;
-/// How far the area of an ellipse with a blob's moments may be from the blob's area, relative; a square is off by 5 %,
-/// a ring by more.
-const ELLIPSE: f64 = 0.12;
-/// How far from where the grid predicts it a disc may be, in steps.
-const NEAR: f64 = 0.3;
+/// Minimum difference of a dark pixel from the local mean, grey levels; camera noise is 1 to 4.
+const MIN_DARKNESS_GREY: f64 = 10.0;
+/// Minimum area of a disc, pixels. The centroid of a smaller disc is worse than a tenth of a pixel.
+const MIN_AREA_PX: usize = 20;
+/// Maximum relative difference between the area of a blob and that of the ellipse with the blob's moments. A square
+/// differs by 5 %, a ring by more.
+const MAX_ELLIPSE_MISFIT: f64 = 0.12;
+/// Maximum distance of a disc from the position that the grid predicts, as a fraction of the grid step.
+const MAX_MISS_STEPS: f64 = 0.3;
 
 struct Blob {
     at: Pixel,
@@ -26,11 +27,11 @@ struct Blob {
     moments: Matrix2<f64>,
 }
 
-/// Finds the grid.
+/// Detects the grid.
 pub(super) fn find(image: &GreyImage, target: &Target) -> Result<Found, NotFound> {
     let blobs = blobs(image);
     let mut best: Option<BTreeMap<(i32, i32), usize>> = None;
-    // A seed beside the board has no grid around it; the blobs nearest to the middle of all come first.
+    // A seed next to the board has no grid around it: try the blobs nearest to the mean position first.
     let middle = blobs.iter().map(|b| b.at).sum::<Pixel>() / blobs.len().max(1) as f64;
     let mut order: Vec<usize> = (0..blobs.len()).collect();
     order.sort_by(|a, b| {
@@ -38,7 +39,7 @@ pub(super) fn find(image: &GreyImage, target: &Target) -> Result<Found, NotFound
         d(a).total_cmp(&d(b))
     });
     for seed in order.into_iter().take(12) {
-        let grid = walk(&blobs, seed);
+        let grid = grow(&blobs, seed);
         if best.as_ref().is_none_or(|b| grid.len() > b.len()) {
             best = Some(grid);
         }
@@ -74,8 +75,8 @@ fn assemble(grid: &BTreeMap<(i32, i32), usize>, blobs: &[Blob], target: &Target)
     Ok(Found { points, blur_px: 1.0 })
 }
 
-/// The grid that is reached from a blob by steps to its neighbours; u goes right, v down.
-fn walk(blobs: &[Blob], seed: usize) -> BTreeMap<(i32, i32), usize> {
+/// Grows the grid from a seed blob by steps to the neighbours; u points right, v down.
+fn grow(blobs: &[Blob], seed: usize) -> BTreeMap<(i32, i32), usize> {
     let mut grid = BTreeMap::new();
     let Some((along, across)) = first_steps(blobs, seed) else { return grid };
     grid.insert((0, 0), seed);
@@ -92,12 +93,12 @@ fn walk(blobs: &[Blob], seed: usize) -> BTreeMap<(i32, i32), usize> {
             let step = along * f64::from(du) + across * f64::from(dv);
             let Some(k) = nearest(blobs, here + step, |k| taken[k]) else { continue };
             let moved = blobs[k].at - here;
-            if (moved - step).norm() > NEAR * step.norm() {
+            if (moved - step).norm() > MAX_MISS_STEPS * step.norm() {
                 continue;
             }
             taken[k] = true;
             grid.insert(next, k);
-            // Half of a step's change is followed, so that one bad centroid does not turn the grid.
+            // Average the old and the new step, so that one bad centroid does not rotate the grid.
             let (a, c) = if du != 0 {
                 ((along + moved * f64::from(du)) * 0.5, across)
             } else {
@@ -115,9 +116,9 @@ fn nearest(blobs: &[Blob], at: Pixel, without: impl Fn(usize) -> bool) -> Option
         .min_by(|a, b| (blobs[*a].at - at).norm_squared().total_cmp(&(blobs[*b].at - at).norm_squared()))
 }
 
-/// Steps from a blob to its neighbours: the two nearest that lie in different directions, the more horizontal one
-/// first. Distances are measured in the disc's own shape, so that foreshortening does not make a diagonal the shorter
-/// way.
+/// Steps from a blob to its neighbours: the two nearest in different directions, the more horizontal one first.
+/// Distances are measured in the metric of the disc's shape, so that foreshortening does not make a diagonal neighbour
+/// the nearer one.
 fn first_steps(blobs: &[Blob], seed: usize) -> Option<(Vector2<f64>, Vector2<f64>)> {
     let here = blobs.get(seed)?;
     let shape = here.moments.try_inverse()?;
@@ -138,7 +139,7 @@ fn first_steps(blobs: &[Blob], seed: usize) -> Option<(Vector2<f64>, Vector2<f64
     Some((a, b))
 }
 
-/// Dark blobs whose shape is an ellipse.
+/// Dark elliptical blobs.
 fn blobs(image: &GreyImage) -> Vec<Blob> {
     let (w, h) = (image.width(), image.height());
     let dark = dark_pixels(image);
@@ -175,10 +176,10 @@ fn blobs(image: &GreyImage) -> Vec<Blob> {
                 visit(k + w);
             }
         }
-        if members.len() >= LEAST_AREA && members.len() < w * h / 16 {
+        if members.len() >= MIN_AREA_PX && members.len() < w * h / 16 {
             out.extend(blob(image, &members));
         }
-        // More blobs than any target has discs: texture, not a target.
+        // No target has this many discs: the blobs are texture.
         if out.len() > 20_000 {
             break;
         }
@@ -186,7 +187,7 @@ fn blobs(image: &GreyImage) -> Vec<Blob> {
     out
 }
 
-/// Pixels darker than the mean around them, over a window of a tenth of the image.
+/// Pixels darker than the local mean; the window is a tenth of the image wide.
 fn dark_pixels(image: &GreyImage) -> Vec<bool> {
     let (w, h) = (image.width(), image.height());
     let mut sums = vec![0_u64; (w + 1) * (h + 1)];
@@ -206,27 +207,27 @@ fn dark_pixels(image: &GreyImage) -> Vec<bool> {
             let s = |x: usize, y: usize| sums[y * (w + 1) + x];
             let sum = s(x1, y1) + s(x0, y0) - s(x0, y1) - s(x1, y0);
             let mean = sum as f64 / ((x1 - x0) * (y1 - y0)) as f64;
-            dark[y * w + x] = f64::from(image.at(x, y)) < mean - DARKER;
+            dark[y * w + x] = f64::from(image.at(x, y)) < mean - MIN_DARKNESS_GREY;
         }
     }
     dark
 }
 
-/// Centroid of the darkness of a blob, over a window of its own shape that reaches into the light around it.
+/// Intensity-weighted centroid of a blob, over a window of the blob's shape that includes the blurred edge.
 fn blob(image: &GreyImage, members: &[usize]) -> Option<Blob> {
     let w = image.width();
     let n = members.len() as f64;
-    let place = |k: &usize| Vector2::new((k % w) as f64, (k / w) as f64);
-    let centre = members.iter().map(place).sum::<Vector2<f64>>() / n;
+    let position = |k: &usize| Vector2::new((k % w) as f64, (k / w) as f64);
+    let centre = members.iter().map(position).sum::<Vector2<f64>>() / n;
     let moments =
-        members.iter().map(|k| (place(k) - centre) * (place(k) - centre).transpose()).sum::<Matrix2<f64>>() / n;
+        members.iter().map(|k| (position(k) - centre) * (position(k) - centre).transpose()).sum::<Matrix2<f64>>() / n;
     let ellipse = 4.0 * std::f64::consts::PI * moments.determinant().max(0.0).sqrt();
-    if !((ellipse / n - 1.0).abs() < ELLIPSE) {
+    if !((ellipse / n - 1.0).abs() < MAX_ELLIPSE_MISFIT) {
         return None;
     }
     let shape = moments.try_inverse()?;
     let semi = 2.0 * moments.symmetric_eigenvalues().amin().sqrt();
-    // In units of the blob's own semi-axes: the blob ends at 1, the blur some pixels outside.
+    // In units of the semi-axes: the blob ends at 1, the blur a few pixels outside.
     let (outer, ring) = (1.0 + 3.0 / semi, 1.0 + 5.0 / semi);
     let mut at = centre;
     let mut covariance = Matrix2::identity();
@@ -234,7 +235,7 @@ fn blob(image: &GreyImage, members: &[usize]) -> Option<Blob> {
         let (inside, window) = gather(image, at, &shape, outer, ring)?;
         let (light, noise) = (mean(&window), deviation(&window).max(0.29));
         let weight: f64 = inside.iter().map(|(_, v)| light - v).sum();
-        if !(weight > 10.0 * LEAST_AREA as f64) {
+        if !(weight > 10.0 * MIN_AREA_PX as f64) {
             return None;
         }
         let mut shift = Vector2::zeros();
@@ -254,7 +255,7 @@ fn blob(image: &GreyImage, members: &[usize]) -> Option<Blob> {
 
 type Window = (Vec<(Vector2<f64>, f64)>, Vec<f64>);
 
-/// Pixels within the window, and the grey values of the light ring around it.
+/// Pixels inside the window, and the grey values of the light ring around it.
 fn gather(image: &GreyImage, at: Pixel, shape: &Matrix2<f64>, outer: f64, ring: f64) -> Option<Window> {
     let box_of = |k: usize| ring * 2.0 * (shape.try_inverse().map_or(0.0, |m| m[(k, k)])).sqrt();
     let (rx, ry) = (box_of(0).ceil(), box_of(1).ceil());

@@ -1,67 +1,67 @@
-//! From two lists of image files to pairs of views with the target's points in them; one image in memory at a time.
+//! Detects the target in two lists of image files; holds one image in memory at a time.
 
 use super::{Found, ImageError, Target, find, list_images, read_image};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// A pair in which the target was found twice.
+/// A pair with the target detected in both images.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FoundPair {
     /// Name of the left image file.
     pub name: String,
-    /// What was found in the left and in the right image.
+    /// The target in the left and in the right image.
     pub found: [Found; 2],
 }
 
-/// What two lists of images hold.
+/// Result of the detection in two lists of images.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Collected {
     /// Pairs with the target in both images.
     pub pairs: Vec<FoundPair>,
-    /// Pairs without: name and reason.
+    /// Pairs without the target: name and reason.
     pub missing: Vec<(String, String)>,
     /// Image sizes, left and right.
     pub sizes: [(u32, u32); 2],
     /// Number of pairs of files.
     pub files: usize,
-    /// Files whose tag says that they are to be turned; they were not.
-    pub turned: usize,
+    /// Number of pairs with an EXIF rotation tag; the rotation was not applied.
+    pub exif_rotated: usize,
 }
 
-/// Why two lists of images are no pairs.
+/// Error of the two lists of images.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum CollectError {
-    /// A list cannot be had.
+    /// A list is invalid.
     #[error(transparent)]
     Image(#[from] ImageError),
     /// The lists have different lengths.
-    #[error("--left names {left} images, --right {right}: a pair needs both; {hint}")]
+    #[error("--left matches {left} images, --right {right}: the numbers must be equal; {hint}")]
     Count {
         /// Left images.
         left: usize,
         /// Right images.
         right: usize,
-        /// Which is probably without its partner.
+        /// The file that probably has no counterpart, or advice.
         hint: String,
     },
-    /// Both lists are the same files.
-    #[error("--left and --right name the same file {path}: give each camera's own images")]
+    /// A file is in both lists.
+    #[error("--left and --right both match {path}: give the images of each camera separately")]
     Same {
-        /// One of them.
+        /// The file.
         path: String,
     },
-    /// No image can be read at all.
-    #[error("none of the images can be read; the first: {first}")]
+    /// No image can be read.
+    #[error("no image can be read; first error: {first}")]
     Unreadable {
-        /// What is wrong with the first.
+        /// Error of the first image.
         first: String,
     },
 }
 
-/// Finds the target in all pairs; `progress` is told the part that is done.
+/// Detects the target in all pairs; calls `progress` with the completed fraction.
 ///
 /// # Errors
-/// Lists that are no pairs. An image that cannot be used is no error, its pair is `missing`.
+/// The lists are invalid. An unusable image is not an error; its pair is reported in `missing`.
 pub fn collect(
     left: &str,
     right: &str,
@@ -71,14 +71,16 @@ pub fn collect(
     let files = [list_images("--left", left)?, list_images("--right", right)?];
     check_lists(&files)?;
     let sizes = [usual_size(&files[0])?, usual_size(&files[1])?];
-    let mut out = Collected { pairs: Vec::new(), missing: Vec::new(), sizes, files: files[0].len(), turned: 0 };
+    let mut out = Collected { pairs: Vec::new(), missing: Vec::new(), sizes, files: files[0].len(), exif_rotated: 0 };
     for (k, (l, r)) in files[0].iter().zip(&files[1]).enumerate() {
         progress(k as f64 / out.files as f64);
         let name = short(l);
-        let mut turned = false;
-        let both: Result<Vec<Found>, String> =
-            [(l, 0), (r, 1)].into_iter().map(|(p, side)| look(p, target, sizes[side], &mut turned)).collect();
-        out.turned += usize::from(turned);
+        let mut exif_rotated = false;
+        let both: Result<Vec<Found>, String> = [(l, 0), (r, 1)]
+            .into_iter()
+            .map(|(p, side)| find_in_file(p, target, sizes[side], &mut exif_rotated))
+            .collect();
+        out.exif_rotated += usize::from(exif_rotated);
         match both {
             Ok(found) => {
                 if let Ok(found) = <[Found; 2]>::try_from(found) {
@@ -91,14 +93,14 @@ pub fn collect(
     Ok(out)
 }
 
-/// One image: the target, or why not.
-fn look(path: &Path, target: &Target, size: (u32, u32), turned: &mut bool) -> Result<Found, String> {
+/// Detects the target in one image file.
+fn find_in_file(path: &Path, target: &Target, size: (u32, u32), exif_rotated: &mut bool) -> Result<Found, String> {
     let file = read_image(path).map_err(|e| e.to_string())?;
-    *turned |= file.turned;
+    *exif_rotated |= file.exif_rotated;
     let (w, h) = (file.grey.width() as u32, file.grey.height() as u32);
     if (w, h) != size {
         return Err(format!(
-            "{}: {w}x{h} pixels, but the others of this camera have {}x{}",
+            "{}: image size mismatch: got {w}x{h}, the other images of this camera have {}x{}",
             short(path),
             size.0,
             size.1
@@ -119,18 +121,18 @@ fn check_lists(files: &[Vec<PathBuf>; 2]) -> Result<(), CollectError> {
     if left.len() == right.len() {
         return Ok(());
     }
-    // Numbers in the names tell who has no partner.
+    // The numbers in the names identify a file without a counterpart.
     let key = |p: &Path| short(p).chars().filter(char::is_ascii_digit).collect::<String>();
     let (more, fewer) = if left.len() > right.len() { (left, right) } else { (right, left) };
     let there: std::collections::BTreeSet<String> = fewer.iter().map(|p| key(p)).collect();
     let alone = more.iter().find(|p| !there.contains(&key(p)));
-    let hint = alone.map_or("take away the images without a partner".to_owned(), |p| {
-        format!("{} seems to have no partner", p.display())
+    let hint = alone.map_or("remove the images without a counterpart".to_owned(), |p| {
+        format!("{} seems to have no counterpart", p.display())
     });
     Err(CollectError::Count { left: left.len(), right: right.len(), hint })
 }
 
-/// The size that most images of a camera have.
+/// The most frequent image size of a camera.
 fn usual_size(files: &[PathBuf]) -> Result<(u32, u32), CollectError> {
     let mut count: BTreeMap<(u32, u32), usize> = BTreeMap::new();
     let mut first = None;

@@ -1,34 +1,34 @@
-//! Image files: which there are, and their grey values, one at a time.
+//! Lists image files and reads their grey values.
 
 use crate::offline::edges::grey_image::GreyImage;
 use image::{ColorType, DynamicImage, ImageDecoder, ImageReader};
 use std::path::{Path, PathBuf};
 
-/// Maximum number of pixels of an image that is read: cameras have fewer, and more would fill the memory.
+/// Maximum number of pixels of an image. Cameras have fewer; larger images would exhaust the memory.
 const MAX_PIXELS: u64 = 120_000_000;
 /// Maximum number of files that one pattern may match.
 const MAX_FILES: usize = 20_000;
 
-/// What is known of an image file.
+/// A decoded image file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImageFile {
     /// The image.
     pub grey: GreyImage,
-    /// The file's EXIF tag asks for a rotation for display (phones and editors write it, camera drivers do not).
-    pub turned: bool,
+    /// Whether the EXIF tag requests a rotation for display (phones and editors write it, camera drivers do not).
+    pub exif_rotated: bool,
 }
 
-/// Why images cannot be read.
+/// Error of listing or reading images.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ImageError {
-    /// The pattern cannot be read.
+    /// The pattern is invalid or matches no usable set of files.
     #[error("{option} {pattern}: {problem}; give a pattern in quotes, such as \"left*.png\", or a folder")]
     Pattern {
-        /// Which option.
+        /// Name of the option.
         option: String,
-        /// What was typed.
+        /// Value of the option.
         pattern: String,
-        /// What is wrong.
+        /// The problem.
         problem: String,
     },
     /// A file cannot be used.
@@ -36,12 +36,12 @@ pub enum ImageError {
     File {
         /// The file.
         path: String,
-        /// What is wrong.
+        /// The problem.
         problem: String,
     },
 }
 
-/// The image files that a pattern or a folder names, in the order of their names, numbers by value (`left2` before
+/// The image files that match a pattern or are in a folder, sorted by name with numbers by value (`left2` before
 /// `left10`).
 ///
 /// # Errors
@@ -72,13 +72,13 @@ pub fn list_images(option: &str, pattern: &str) -> Result<Vec<PathBuf>, ImageErr
         return Err(refuse("no image file matches".to_owned()));
     }
     if files.len() > MAX_FILES {
-        return Err(refuse(format!("it matches more than {MAX_FILES} files")));
+        return Err(refuse(format!("more than {MAX_FILES} files match")));
     }
     files.sort_by_cached_key(|p| natural_key(&p.to_string_lossy()));
     Ok(files)
 }
 
-/// Text pieces and numbers of a name, so that 2 comes before 10.
+/// Sort key: the text and number parts of a name, so that 2 sorts before 10.
 fn natural_key(name: &str) -> Vec<(u128, String)> {
     let mut out: Vec<(u128, String)> = vec![(0, String::new())];
     let mut digits = String::new();
@@ -100,11 +100,11 @@ fn natural_key(name: &str) -> Vec<(u128, String)> {
     out
 }
 
-/// Reads an image: colour becomes grey, 16 bits become 8 by the bits that are in use. It is not rotated, whatever its
-/// EXIF tag says: a calibration belongs to the sensor's rows and columns.
+/// Reads an image and converts it to 8-bit grey; of 16 bits the upper eight that are in use are kept. An EXIF rotation
+/// is not applied: a calibration refers to the rows and columns of the sensor.
 ///
 /// # Errors
-/// What is wrong with the file.
+/// The problem of the file.
 pub fn read_image(path: &Path) -> Result<ImageFile, ImageError> {
     let refuse = |problem: String| ImageError::File { path: path.display().to_string(), problem };
     let reader =
@@ -112,20 +112,21 @@ pub fn read_image(path: &Path) -> Result<ImageFile, ImageError> {
     let mut decoder = reader.into_decoder().map_err(|e| refuse(e.to_string()))?;
     let (w, h) = decoder.dimensions();
     if w == 0 || h == 0 || u64::from(w) * u64::from(h) > MAX_PIXELS {
-        return Err(refuse(format!("{w}x{h} pixels is not the size of a camera image")));
+        return Err(refuse(format!("unsupported image size {w}x{h}: an image must have 1 to {MAX_PIXELS} pixels")));
     }
-    let turned = decoder.orientation().is_ok_and(|o| o != image::metadata::Orientation::NoTransforms);
-    let deep = matches!(decoder.color_type(), ColorType::L16 | ColorType::La16 | ColorType::Rgb16 | ColorType::Rgba16);
+    let exif_rotated = decoder.orientation().is_ok_and(|o| o != image::metadata::Orientation::NoTransforms);
+    let sixteen_bits =
+        matches!(decoder.color_type(), ColorType::L16 | ColorType::La16 | ColorType::Rgb16 | ColorType::Rgba16);
     let image = DynamicImage::from_decoder(decoder).map_err(|e| refuse(e.to_string()))?;
-    let grey = if deep { shallow(&image.into_luma16()) } else { image.into_luma8().into_raw() };
+    let grey = if sixteen_bits { to_8_bits(&image.into_luma16()) } else { image.into_luma8().into_raw() };
     let grey =
         GreyImage::new(w as usize, h as usize, grey).ok_or_else(|| refuse("the file is truncated".to_owned()))?;
-    Ok(ImageFile { grey, turned })
+    Ok(ImageFile { grey, exif_rotated })
 }
 
-/// Eight of sixteen bits: those of the brightest pixel and below, since 10 and 12 bit cameras leave the upper ones
-/// empty.
-fn shallow(image: &image::ImageBuffer<image::Luma<u16>, Vec<u16>>) -> Vec<u8> {
+/// Reduces 16 bits to 8: the eight bits from the highest set bit of the brightest pixel downwards, since cameras with
+/// 10 or 12 bits leave the upper bits empty.
+fn to_8_bits(image: &image::ImageBuffer<image::Luma<u16>, Vec<u16>>) -> Vec<u8> {
     let brightest = image.as_raw().iter().copied().max().unwrap_or(0);
     let shift = (16 - brightest.leading_zeros()).saturating_sub(8);
     image.as_raw().iter().map(|v| (v >> shift) as u8).collect()
@@ -136,29 +137,29 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_ordered_by_their_numbers() {
+    fn names_are_sorted_by_number_value() {
         let mut names = vec!["left10.png", "left2.png", "left1.png", "a/left3.png", "left2b.png"];
         names.sort_by_cached_key(|n| natural_key(n));
         assert_eq!(names, ["a/left3.png", "left1.png", "left2.png", "left2b.png", "left10.png"]);
     }
 
     #[test]
-    fn patterns_that_name_nothing_say_so() {
+    fn patterns_without_a_match_are_reported() {
         let e = list_images("--left", "no/such/*.png").unwrap_err().to_string();
         assert!(e.contains("--left") && e.contains("no/such"), "{e}");
         assert!(list_images("--left", "a***").unwrap_err().to_string().contains("in quotes"));
     }
 
     #[test]
-    fn colour_depth_and_size_are_read_or_refused() {
+    fn colour_and_16_bit_images_are_converted_and_other_files_rejected() {
         let dir = std::env::temp_dir().join(format!("graspd-images-{}", std::process::id()));
         std::fs::create_dir_all(&dir).unwrap();
         let twelve_bits =
             image::ImageBuffer::<image::Luma<u16>, _>::from_fn(8, 4, |x, _| image::Luma([x as u16 * 512]));
-        let path = dir.join("deep.png");
+        let path = dir.join("sixteen_bits.png");
         twelve_bits.save(&path).unwrap();
         let read = read_image(&path).unwrap();
-        assert_eq!((read.grey.width(), read.grey.at(7, 3), read.grey.at(1, 0), read.turned), (8, 224, 32, false));
+        assert_eq!((read.grey.width(), read.grey.at(7, 3), read.grey.at(1, 0), read.exif_rotated), (8, 224, 32, false));
         let colour = dir.join("colour.png");
         image::RgbImage::from_pixel(6, 5, image::Rgb([200, 200, 200])).save(&colour).unwrap();
         assert_eq!(read_image(&colour).unwrap().grey.at(2, 2), 200);

@@ -1,4 +1,4 @@
-//! The calibration target: what is printed on it, and where its points stand in an image.
+//! The calibration target: the printed pattern, and detection of its points in an image.
 
 mod charuco;
 mod chessboard;
@@ -18,49 +18,49 @@ pub use spec::{Kind, Target, TargetError};
 use graspd_rt::geom::Pixel;
 use nalgebra::Matrix2;
 
-/// A target point seen in an image.
+/// A target point detected in an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Seen {
-    /// Which point of the target, as [`Target::point`] counts them.
+    /// Index of the point, as in [`Target::point`].
     pub index: usize,
-    /// Where it is in the image, pixels, lens distortion included.
+    /// Position in the image including lens distortion, pixels.
     pub at: Pixel,
-    /// Covariance of that place, px squared.
+    /// Covariance of the position, px squared.
     pub covariance: Matrix2<f64>,
 }
 
-/// A target found in an image.
+/// A target detected in an image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Found {
-    /// Its points, by index.
+    /// Points, sorted by index.
     pub points: Vec<Seen>,
-    /// Width of the target's edges (one standard deviation of the blur), median over the points, pixels.
+    /// Blur of the target's edges (one standard deviation), median over the points, pixels.
     pub blur_px: f64,
 }
 
-/// Why an image has no target in it.
+/// Reason why no target was detected in an image.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum NotFound {
-    /// Nothing like it.
-    #[error("no {0} in it")]
+    /// No target of the kind.
+    #[error("no {0} detected")]
     Nothing(&'static str),
-    /// A grid of another size.
+    /// A grid of a different size.
     #[error(
-        "a grid of {found_cols}x{found_rows} points in it, but the target has {cols}x{rows}: part of the board is hidden or outside, or --target counts differently (it counts inner corners)"
+        "detected a grid of {found_cols}x{found_rows} points, but the target has {cols}x{rows}: part of the board is hidden or outside the image, or --target has wrong counts (a chessboard counts inner corners)"
     )]
     Size {
-        /// Points across that were found.
+        /// Columns of points detected.
         found_cols: usize,
-        /// Points down that were found.
+        /// Rows of points detected.
         found_rows: usize,
-        /// Points across of the target.
+        /// Columns of points of the target.
         cols: usize,
-        /// Points down of the target.
+        /// Rows of points of the target.
         rows: usize,
     },
-    /// Too few of its points can be measured.
+    /// Too few points of the target can be measured.
     #[error(
-        "only {found} of the target's {expected} points can be measured: blurred, too dark, or too small in the image"
+        "only {found} of the target's {expected} points can be measured: the image is blurred or too dark, or the target is too small in it"
     )]
     Few {
         /// Points measured.
@@ -70,26 +70,27 @@ pub enum NotFound {
     },
 }
 
-/// Finds the target in an image.
+/// Detects the target in an image.
 ///
 /// # Errors
-/// Why not.
+/// The reason why it was not detected.
 pub fn find(image: &GreyImage, target: &Target) -> Result<Found, NotFound> {
     let found = match &target.kind {
         Kind::Chessboard => chessboard::find(image, target),
         Kind::Charuco { .. } => charuco::find(image, target),
         Kind::Circles { .. } => circles::find(image, target),
     }?;
-    let least = least_points(target);
-    if found.points.len() < least {
+    let min = min_points(target);
+    if found.points.len() < min {
         return Err(NotFound::Few { found: found.points.len(), expected: target.count() });
     }
     Ok(found)
 }
 
-/// Points without which a view is not used: a board's pose from fewer is hardly redundant (six unknowns, twelve
-/// equations at six points); a chessboard and a circle grid of which half is missing were not found but guessed.
-fn least_points(target: &Target) -> usize {
+/// Minimum number of points of a view. With fewer points the pose of a board has little redundancy (six unknowns,
+/// twelve equations at six points). A chessboard or a circle grid with half of its points missing is not a reliable
+/// detection.
+fn min_points(target: &Target) -> usize {
     match target.kind {
         Kind::Charuco { .. } => 8,
         Kind::Chessboard | Kind::Circles { .. } => (target.count() / 2).max(8),

@@ -1,40 +1,43 @@
-//! Where a chessboard corner is, to a hundredth of a pixel: least squares of a blurred corner's grey values.
+//! Subpixel refinement of a chessboard corner: least-squares fit of a blurred corner to the grey values, accurate to a
+//! hundredth of a pixel.
 //!
 //! The model is m + c tanh(d1 / s) tanh(d2 / s), where d1 and d2 are the distances from the two edges through the
-//! corner. It is symmetric about the corner, and so is the window, so that neither the edges' true profile nor their
-//! blur moves it.
+//! corner. Model and window are symmetric about the corner, so that neither the true profile of the edges nor their
+//! blur biases the position.
 
 use super::GreyImage;
 use graspd_rt::geom::Pixel;
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
-/// Largest radius of the window, pixels: beyond it a lens bends the edges, and the noise is below 0.02 px already.
+/// Maximum radius of the window, pixels. In a larger window lens distortion bends the edges, and the noise of the
+/// position is already below 0.02 px.
 const MAX_RADIUS_PX: f64 = 9.0;
-/// Smallest radius: fewer pixels than these do not determine seven unknowns.
+/// Minimum radius of the window, pixels. A smaller window does not determine the seven unknowns.
 const MIN_RADIUS_PX: f64 = 2.5;
-/// A fit that ends farther from where it started is another corner, as a part of the distance to the next one.
-const MAX_MOVE: f64 = 0.35;
-/// Grey levels between dark and light below which there is no corner (twice the model's c); camera noise is 1 to 4.
-const MIN_CONTRAST: f64 = 12.0;
+/// Maximum distance between the start and the end of a fit, as a fraction of the distance to the next corner. A fit
+/// that ends farther away converged to a different corner.
+const MAX_MOVE_STEPS: f64 = 0.35;
+/// Minimum difference between light and dark (twice the model's c), grey levels; camera noise is 1 to 4.
+const MIN_CONTRAST_GREY: f64 = 12.0;
 
-/// Part of the half contrast that the model may leave unexplained: sharp corners of clean and of compressed images
-/// leave 0.03 to 0.15, the border of a board 0.5 and more.
-const MISFIT: f64 = 0.3;
-/// Camera noise that is allowed for besides, grey levels.
-const NOISE: f64 = 3.0;
+/// Maximum RMS residual as a fraction of the half contrast: sharp corners in clean and in compressed images have 0.03
+/// to 0.15, the border of a board has 0.5 and more.
+const MAX_MISFIT: f64 = 0.3;
+/// Camera noise that is allowed in addition, grey levels.
+const NOISE_GREY: f64 = 3.0;
 
-/// What is measured at a corner.
+/// A measured corner.
 pub(super) struct Saddle {
     pub(super) at: Pixel,
     pub(super) covariance: Matrix2<f64>,
     /// Blur, one standard deviation, pixels.
     pub(super) blur: f64,
-    /// Whether the square between the directions along and across is light.
+    /// Whether the square between the directions `along` and `across` is light.
     pub(super) light: bool,
 }
 
 /// Measures the corner near `at`. `along` and `across` are the steps to the next corners of the grid, pixels; `reach`
-/// is how far the plain squares reach, in steps.
+/// is the extent of the uniform squares around the corner, in steps.
 pub(super) fn measure(
     image: &GreyImage,
     at: Pixel,
@@ -70,20 +73,20 @@ pub(super) fn measure(
     }
     let moved = Pixel::new(p[0], p[1]) - at;
     let steps = Matrix2::from_columns(&[along, across]).try_inverse()? * moved;
-    if !(steps.amax() < MAX_MOVE && 2.0 * p[5].abs() > MIN_CONTRAST) {
+    if !(steps.amax() < MAX_MOVE_STEPS && 2.0 * p[5].abs() > MIN_CONTRAST_GREY) {
         return None;
     }
     let freedom = (window.pixels.len() as f64 - 7.0).max(1.0);
-    // Rounding to whole grey levels leaves 1/12 however clean the image.
+    // Rounding to integer grey levels has a variance of 1/12 even in a noise-free image.
     let variance = (last.cost / freedom).max(1.0 / 12.0);
-    // Where a board ends, three squares around a point are light: the model leaves half of such a corner's contrast
-    // unexplained.
-    if !(variance < (MISFIT * p[5]).powi(2) + NOISE.powi(2)) {
+    // At the border of a board, three squares around a point are light: the residual is half of the contrast of such a
+    // corner.
+    if !(variance < (MAX_MISFIT * p[5]).powi(2) + NOISE_GREY.powi(2)) {
         return None;
     }
     let inverse = last.normal.try_inverse()?;
     let covariance = inverse.fixed_view::<2, 2>(0, 0) * variance;
-    // tanh(d / s) has the slope of an error function of standard deviation s sqrt(2 / pi).
+    // tanh(d / s) has the slope of an error function with standard deviation s sqrt(2 / pi).
     Some(Saddle { at: Pixel::new(p[0], p[1]), covariance, blur: p[6] * 0.798, light: p[5] > 0.0 })
 }
 
@@ -98,17 +101,17 @@ struct Linear {
 }
 
 struct Window {
-    /// Place and grey value.
+    /// Position and grey value.
     pixels: Vec<(Vector2<f64>, f64)>,
 }
 
 impl Window {
-    /// The pixels that belong to the four squares around the corner, and to no other edge.
+    /// The pixels of the four squares around the corner, without those near any other edge.
     fn new(image: &GreyImage, at: Pixel, along: Vector2<f64>, across: Vector2<f64>, reach: f64) -> Option<Self> {
         let to_steps = Matrix2::from_columns(&[along, across]).try_inverse()?;
         let radius = (reach * along.norm().max(across.norm())).clamp(MIN_RADIUS_PX, MAX_RADIUS_PX);
         let (w, h) = (image.width() as f64 - 1.0, image.height() as f64 - 1.0);
-        // A window that the image's border cuts is not symmetric any more: it is made smaller.
+        // A window cut by the image border is not symmetric: reduce its radius.
         let border = at.x.min(at.y).min(w - at.x).min(h - at.y) - 1.0;
         let radius = radius.min(border);
         if !(radius >= MIN_RADIUS_PX) {
@@ -122,7 +125,7 @@ impl Window {
                 let p = Vector2::new(u0 + du as f64, v0 + dv as f64);
                 let d = p - at;
                 let s = to_steps * d;
-                // Small boards: the innermost pixels count whatever the squares' size.
+                // Small boards: the innermost pixels are included for any size of the squares.
                 if d.norm() <= radius && (s.amax() <= reach || d.norm() <= MIN_RADIUS_PX) {
                     pixels.push((p, f64::from(image.at(p.x as usize, p.y as usize))));
                 }
@@ -144,8 +147,8 @@ impl Window {
         if !(even.is_finite() && odd.is_finite()) {
             return None;
         }
-        // The normal of the edge along `across` points along `along`, so that the product is positive where both steps
-        // are.
+        // The normal of the edge along `across` points along `along`, so that the product is positive between the two
+        // steps.
         let n1 = angle(across) + std::f64::consts::PI;
         let n2 = angle(along);
         Some(P::from([at.x, at.y, n1, n2, 0.5 * (even + odd), 0.5 * (even - odd), 1.2]))

@@ -1,18 +1,18 @@
-//! What is printed on the target, from the text that the user types.
+//! The printed pattern of the target, parsed from `--target`.
 
 use calib_targets_charuco::{Dictionary, resolve_dictionary};
 use nalgebra::Vector2;
 
-/// What the target's points are.
+/// Kind of the target's points.
 #[derive(Clone, Copy, Debug)]
 pub enum Kind {
     /// Inner corners of a chessboard.
     Chessboard,
     /// Inner corners of a chessboard with ArUco markers in its white squares.
     Charuco {
-        /// Side of a marker, in squares.
+        /// Side of a marker as a fraction of a square's side.
         marker: f64,
-        /// The markers' dictionary.
+        /// Dictionary of the markers.
         dictionary: Dictionary,
     },
     /// Centres of dark discs on a square grid.
@@ -25,38 +25,38 @@ pub enum Kind {
 /// A flat target: a grid of points.
 #[derive(Clone, Copy, Debug)]
 pub struct Target {
-    /// What the points are.
+    /// Kind of the points.
     pub kind: Kind,
-    /// Points across.
+    /// Columns of points.
     pub cols: usize,
-    /// Points down.
+    /// Rows of points.
     pub rows: usize,
-    /// Distance of neighbouring points, metres.
+    /// Distance between neighbouring points, metres.
     pub spacing: f64,
 }
 
-/// Why a target's text is refused.
+/// Error of the text of `--target`.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "--target {text}: {problem}; give chessboard:COLSxROWS:SQUARE (inner corners, metres), charuco:COLSxROWS:SQUARE:MARKER:DICTIONARY (squares, metres; for example DICT_4X4_50) or circles:COLSxROWS:SPACING:DIAMETER (metres)"
 )]
 pub struct TargetError {
-    /// What was typed.
+    /// The text.
     pub text: String,
-    /// What is wrong with it.
+    /// The problem.
     pub problem: String,
 }
 
-/// Fewest and most points across or down.
-const SIDE: std::ops::RangeInclusive<usize> = 3..=200;
-/// A square of less than half a millimetre or more than half a metre is a unit mixed up.
-const SPACING_M: std::ops::RangeInclusive<f64> = 0.0005..=0.5;
+/// Valid number of columns and of rows of points.
+const GRID_SIDE: std::ops::RangeInclusive<usize> = 3..=200;
+/// Valid range of a length on the target, metres. A value outside it has the wrong unit.
+const LENGTH_M: std::ops::RangeInclusive<f64> = 0.0005..=0.5;
 
 impl Target {
-    /// Reads "chessboard:9x6:0.025" and its like.
+    /// Parses a text such as "chessboard:9x6:0.025".
     ///
     /// # Errors
-    /// What is wrong, and the forms there are.
+    /// The problem and the valid forms.
     pub fn parse(text: &str) -> Result<Self, TargetError> {
         let refuse = |problem: String| TargetError { text: text.to_owned(), problem };
         let parts: Vec<&str> = text.split(':').map(str::trim).collect();
@@ -84,17 +84,20 @@ impl Target {
             ("circles", [diameter]) => {
                 let diameter = length(diameter).map_err(&refuse)?;
                 if diameter >= spacing {
-                    return Err(refuse("the discs would touch: the diameter is not less than the spacing".to_owned()));
+                    return Err(refuse("the discs would touch: the diameter must be less than the spacing".to_owned()));
                 }
                 Self { kind: Kind::Circles { diameter }, cols, rows, spacing }
             }
             ("chessboard" | "charuco" | "circles", _) => {
-                return Err(refuse(format!("a {kind} has another number of parts")));
+                return Err(refuse(format!("wrong number of parts for {kind}")));
             }
             _ => return Err(refuse(format!("{kind:?} is not a kind of target"))),
         };
-        if !SIDE.contains(&target.cols) || !SIDE.contains(&target.rows) {
-            return Err(refuse(format!("a grid of {}x{} points cannot be used", target.cols, target.rows)));
+        if !GRID_SIDE.contains(&target.cols) || !GRID_SIDE.contains(&target.rows) {
+            return Err(refuse(format!(
+                "a grid of {}x{} points is outside the supported range of 3 to 200 points per side",
+                target.cols, target.rows
+            )));
         }
         Ok(target)
     }
@@ -104,7 +107,7 @@ impl Target {
         self.cols * self.rows
     }
 
-    /// Place of a point on the target, metres: x along the rows, y down, the first point at the origin.
+    /// Position of a point on the target, metres: x along the rows, y down, the first point at the origin.
     pub fn point(&self, index: usize) -> Vector2<f64> {
         let (c, r) = (index % self.cols, index / self.cols);
         Vector2::new(c as f64, r as f64) * self.spacing
@@ -115,12 +118,12 @@ impl Target {
         Vector2::new((self.cols - 1) as f64, (self.rows - 1) as f64) * self.spacing
     }
 
-    /// Index of a grid place.
+    /// Index of the point in a column and row.
     pub fn index(&self, col: usize, row: usize) -> usize {
         row * self.cols + col
     }
 
-    /// Diameter of a disc, metres; `None` for corners.
+    /// Diameter of a disc, metres; `None` for targets with corners.
     pub fn disc(&self) -> Option<f64> {
         match self.kind {
             Kind::Circles { diameter } => Some(diameter),
@@ -128,14 +131,14 @@ impl Target {
         }
     }
 
-    /// Whether every point has an identity of its own, so that part of the target is enough.
+    /// Whether markers identify every point, so that a part of the target is sufficient.
     pub fn has_ids(&self) -> bool {
         matches!(self.kind, Kind::Charuco { .. })
     }
 
-    /// The relabellings under which the target looks the same and keeps its handedness: the point that each index
-    /// becomes. The first is the identity. Colours are not looked at here.
-    pub fn turns(&self) -> Vec<Vec<usize>> {
+    /// The rotations that map the grid onto itself, as permutations: the new index for each index. The first is the
+    /// identity. Colours of squares are not considered.
+    pub fn rotations(&self) -> Vec<Vec<usize>> {
         let (n, m) = (self.cols, self.rows);
         let turn = |f: &dyn Fn(usize, usize) -> (usize, usize)| -> Vec<usize> {
             (0..self.count())
@@ -158,11 +161,11 @@ impl Target {
     }
 }
 
-/// A length in metres.
+/// Parses a length in metres.
 fn length(text: &str) -> Result<f64, String> {
     let v: f64 = text.parse().map_err(|_| format!("{text:?} is not a length in metres"))?;
-    if !SPACING_M.contains(&v) {
-        return Err(format!("{text} is not a length in metres that a target has (25 mm are 0.025)"));
+    if !LENGTH_M.contains(&v) {
+        return Err(format!("{text} m is outside the range of lengths on a target, 0.0005 to 0.5 m (25 mm is 0.025)"));
     }
     Ok(v)
 }
@@ -172,7 +175,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn texts_are_read_or_refused_with_the_reason() {
+    fn valid_texts_are_parsed_and_invalid_ones_rejected_with_a_reason() {
         let t = Target::parse("chessboard:9x6:0.025").unwrap();
         assert_eq!((t.cols, t.rows, t.spacing, t.count()), (9, 6, 0.025, 54));
         assert_eq!(t.point(10), Vector2::new(0.025, 0.025));
@@ -196,12 +199,12 @@ mod tests {
     }
 
     #[test]
-    fn turns_are_permutations_that_keep_the_handedness() {
+    fn rotations_are_permutations_that_preserve_handedness() {
         for text in ["chessboard:9x6:0.025", "chessboard:6x6:0.025"] {
             let t = Target::parse(text).unwrap();
-            let turns = t.turns();
-            assert_eq!(turns.len(), if t.cols == t.rows { 4 } else { 2 });
-            for map in turns {
+            let rotations = t.rotations();
+            assert_eq!(rotations.len(), if t.cols == t.rows { 4 } else { 2 });
+            for map in rotations {
                 let mut seen = map.clone();
                 seen.sort_unstable();
                 assert!(seen.into_iter().eq(0..t.count()));

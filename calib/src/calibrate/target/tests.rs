@@ -1,4 +1,4 @@
-//! Rendered targets with known places: found, labelled, and measured to a few hundredths of a pixel.
+//! Detection, labels and accuracy on rendered targets with known positions.
 
 use super::*;
 use graspd_rt::geom::{Camera, Distortion, Pose, Vec3, exp_twist};
@@ -11,7 +11,7 @@ fn camera() -> Camera {
     Camera { width: 640, height: 480, fx: 600.0, fy: 600.0, cx: 322.0, cy: 238.0, distortion }
 }
 
-/// Grey value of the target's plane at a point, metres.
+/// Grey value of the target's plane at a point given in metres.
 fn paint(target: &Target, x: f64, y: f64) -> f64 {
     let (u, v) = (x / target.spacing, y / target.spacing);
     let inside = u > -1.0 && v > -1.0 && u < target.cols as f64 && v < target.rows as f64;
@@ -30,7 +30,7 @@ fn paint(target: &Target, x: f64, y: f64) -> f64 {
     if dark { 40.0 } else { 200.0 }
 }
 
-/// The target as the camera sees it, 5 x 5 rays a pixel, with noise.
+/// Renders the target with 5 x 5 rays per pixel and noise.
 fn render(target: &Target, pose: &Pose, seed: u64) -> GreyImage {
     let (c, back) = (camera(), pose.inverse());
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
@@ -62,7 +62,7 @@ fn pose(target: &Target, turn: [f64; 3]) -> Pose {
         * exp_twist(&Vector6::new(-0.5 * size.x, -0.5 * size.y, 0.0, 0.0, 0.0, 0.0))
 }
 
-/// Root mean square distance of found points from the true ones, and whether the labels are true.
+/// Root mean square distance between detected and true points; a wrong label makes it large.
 fn error_px(target: &Target, pose: &Pose, found: &Found) -> f64 {
     let c = camera();
     let turn = pose.rotation;
@@ -80,27 +80,27 @@ fn error_px(target: &Target, pose: &Pose, found: &Found) -> f64 {
 }
 
 #[test]
-fn rendered_targets_are_found_to_hundredths_of_a_pixel() {
-    for (text, turns) in [
+fn rendered_targets_are_measured_to_hundredths_of_a_pixel() {
+    for (text, rotations) in [
         ("chessboard:9x6:0.025", [[0.0, 0.0, 0.05], [0.5, 0.3, 0.2], [-0.4, 0.5, -0.3]]),
         ("circles:9x6:0.025:0.014", [[0.0, 0.0, 0.05], [0.5, 0.3, 0.2], [-0.4, 0.5, -0.3]]),
     ] {
         let target = Target::parse(text).unwrap();
-        for (k, turn) in turns.into_iter().enumerate() {
+        for (k, turn) in rotations.into_iter().enumerate() {
             let pose = pose(&target, turn);
             let found = find(&render(&target, &pose, k as u64), &target).unwrap();
             assert_eq!(found.points.len(), 54, "{text} {turn:?}");
             let e = error_px(&target, &pose, &found);
             assert!(e < 0.05, "{text} {turn:?}: {e} px");
-            // The stated covariance is that of the error, within what blur and pixels leave open.
-            let said = (found.points.iter().map(|s| s.covariance.trace()).sum::<f64>() / 54.0).sqrt();
-            assert!(e / said < 4.0 && said < 0.1, "{text}: {e} px, said {said}");
+            // The stated covariance agrees with the error, within the uncertainty of blur and pixel size.
+            let stated = (found.points.iter().map(|s| s.covariance.trace()).sum::<f64>() / 54.0).sqrt();
+            assert!(e / stated < 4.0 && stated < 0.1, "{text}: {e} px, stated {stated} px");
         }
     }
 }
 
 #[test]
-fn what_is_no_target_or_another_is_refused_with_the_reason() {
+fn images_without_the_target_are_rejected_with_the_reason() {
     let target = Target::parse("chessboard:9x6:0.025").unwrap();
     let grey = GreyImage::new(640, 480, vec![128; 640 * 480]).unwrap();
     assert!(find(&grey, &target).unwrap_err().to_string().contains("no chessboard"));
