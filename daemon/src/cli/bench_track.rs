@@ -1,4 +1,4 @@
-//! `graspd bench track`: the tracker on a recorded sequence whose truth is known: how long, how exact, how honest.
+//! `graspd bench track`: time, accuracy and covariance consistency of the tracker on a sequence with ground truth.
 
 use super::args::BenchTrackArgs;
 use super::sequence::{Frame, Sequence};
@@ -12,18 +12,18 @@ use graspd_rt::online::{StepStage, StereoFrame, Vision, VisionCycle, VisionSetti
 use serde_json::{Value, json};
 use std::time::Instant;
 
-/// Between two frames of a sequence, ns: 60 a second.
+/// Frame period of a sequence, ns: 60 frames per second.
 const PERIOD_NS: u64 = 16_666_667;
-/// Stages of a frame as they are reported.
+/// Reported stages of a frame.
 const STAGES: [&str; 6] = ["check", "marks", "pose", "watch", "judge", "law"];
 
-/// What is gathered over the frames of one condition.
+/// Statistics over the frames of one condition.
 #[derive(Default)]
 struct Tally {
-    /// Of each frame, the times of its stages, us.
+    /// Time of each stage of each frame, us.
     stages: [Vec<f64>; STAGES.len()],
     step: Vec<f64>,
-    whole: Vec<f64>,
+    step_and_law: Vec<f64>,
     heap_calls: u64,
     lost: usize,
     marks: usize,
@@ -37,10 +37,10 @@ struct Tally {
     radians: Vec<f64>,
 }
 
-/// Runs it and prints a line for each condition.
+/// Runs the benchmark and prints one line per condition.
 ///
 /// # Errors
-/// Usage, and files of the sequence that cannot be read.
+/// Invalid arguments, and files of the sequence that cannot be read.
 pub fn bench_track(args: &BenchTrackArgs) -> Result<Exit, Failure> {
     if args.passes == 0 || args.passes > 1000 {
         return Err(Failure { exit: Exit::Usage, message: format!("--passes {}: give 1 to 1000", args.passes) });
@@ -51,7 +51,10 @@ pub fn bench_track(args: &BenchTrackArgs) -> Result<Exit, Failure> {
     if conditions.is_empty() {
         let asked = args.condition.as_deref().unwrap_or_default();
         let known = sequence.conditions.join(", ");
-        return Err(Failure { exit: Exit::Usage, message: format!("--condition {asked}: the sequence has {known}") });
+        return Err(Failure {
+            exit: Exit::Usage,
+            message: format!("--condition {asked}: no such condition; the sequence has {known}"),
+        });
     }
     for condition in conditions {
         let frames = sequence.frames(condition)?;
@@ -60,13 +63,13 @@ pub fn bench_track(args: &BenchTrackArgs) -> Result<Exit, Failure> {
         if args.json {
             println!("{line}");
         } else {
-            println!("{}", words(&line));
+            println!("{}", summary(&line));
         }
     }
     Ok(Exit::Done)
 }
 
-/// Plays the frames forward and backward, so that motion stays continuous.
+/// Plays the frames forward and backward alternately, so that the motion is continuous.
 fn run(sequence: &Sequence, frames: &[Frame], args: &BenchTrackArgs) -> Tally {
     let mut tally = Tally::default();
     let mut cycle = VisionCycle::new(sequence.rig, sequence.gripper.clone(), VisionSettings::default());
@@ -76,7 +79,7 @@ fn run(sequence: &Sequence, frames: &[Frame], args: &BenchTrackArgs) -> Tally {
         for k in 0..frames.len() {
             let at = if pass % 2 == 0 { k } else { frames.len() - 1 - k };
             number += 1;
-            // The first frames teach the blur; they are tracked, and not counted.
+            // The tracker estimates the blur on the first frames; they are tracked but not counted.
             step(sequence, &frames[at], at, number, &mut cycle, args, (number > 3).then_some(&mut tally));
         }
     }
@@ -97,7 +100,7 @@ fn step(
     let stamp = number * PERIOD_NS;
     let pair = StereoFrame { left, right, sequence: number, capture_ns: [stamp; 2], now_ns: stamp + 1_000_000 };
     let truth = sequence.left_from_gripper[at];
-    // The encoders know the motion: the truth's, in a base that has nothing to do with the rig.
+    // Ideal encoders: the true motion. The choice of the base frame is arbitrary.
     let encoders = args.encoders.then_some(truth);
     let calls = heap::calls();
     let begin = Instant::now();
@@ -125,21 +128,21 @@ fn step(
         list.push(v);
     }
     t.step.push(us(begin, stepped));
-    t.whole.push(us(begin, end));
+    t.step_and_law.push(us(begin, end));
     match seen {
         Ok(v) if v.status != VisionStatus::Lost => errors(sequence, at, &v, &truth, t),
         _ => t.lost += 2 * sequence.gripper.marks.len(),
     }
 }
 
-/// The screw that the law makes of the marks, towards the sequence's goal.
+/// The velocity screw that the control law computes from the marks, towards the goal of the sequence.
 fn law(sequence: &Sequence, v: &Vision) -> Option<graspd_rt::online::screw::Screw> {
     let mut stack = Stack::new(&LawSettings::default());
     for view in View::BOTH {
         let camera = sequence.rig.camera(view);
-        let place = sequence.rig.view_from_left(view);
-        let now = PlacedView::new(camera, &(place * v.left_from_gripper));
-        let goal = PlacedView::new(camera, &(place * sequence.goal));
+        let view_from_left = sequence.rig.view_from_left(view);
+        let now = PlacedView::new(camera, &(view_from_left * v.left_from_gripper));
+        let goal = PlacedView::new(camera, &(view_from_left * sequence.goal));
         for (mark, seen) in sequence.gripper.marks.iter().zip(&v.marks[view.index()]) {
             let (Some(seen), Some(reference)) = (seen, goal.project(&mark.position)) else { continue };
             let error = MarkError { now: seen.pixel, reference, covariance: seen.covariance, factor: 1.0 };
@@ -171,11 +174,11 @@ fn errors(sequence: &Sequence, at: usize, v: &Vision, truth: &Pose, t: &mut Tall
     t.radians.push(e.fixed_rows::<3>(3).norm());
 }
 
-/// Median, 99th percentile and best of a list of times.
+/// Median, 99th percentile and minimum of a list of times.
 fn times(list: &[f64]) -> Value {
     let mut v = list.to_vec();
     v.sort_by(f64::total_cmp);
-    let at = |share: f64| v.get(((v.len() as f64 * share) as usize).min(v.len().saturating_sub(1))).copied();
+    let at = |fraction: f64| v.get(((v.len() as f64 * fraction) as usize).min(v.len().saturating_sub(1))).copied();
     let round = |x: Option<f64>| x.map(|x| (x * 100.0).round() / 100.0);
     json!({ "median": round(at(0.5)), "p99": round(at(0.99)), "best": round(v.first().copied()) })
 }
@@ -185,13 +188,13 @@ fn report(condition: &str, t: &Tally, encoders: bool) -> Value {
     let stages: serde_json::Map<String, Value> =
         STAGES.iter().zip(&t.stages).map(|(name, list)| ((*name).to_owned(), times(list))).collect();
     let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len().max(1) as f64;
-    let most = |v: &[f64]| v.iter().copied().fold(0.0, f64::max);
+    let max = |v: &[f64]| v.iter().copied().fold(0.0, f64::max);
     json!({
         "condition": condition,
         "prediction": if encoders { "encoders" } else { "images" },
         "frames": t.step.len(),
         "step_us": times(&t.step),
-        "step_and_law_us": times(&t.whole),
+        "step_and_law_us": times(&t.step_and_law),
         "stage_us": stages,
         "heap_calls": t.heap_calls,
         "marks": t.marks,
@@ -204,20 +207,20 @@ fn report(condition: &str, t: &Tally, encoders: bool) -> Value {
         "normalised_error_squared": t.normalised / (2.0 * n),
         "pose": {
             "mean_mm": mean(&t.metres) * 1e3,
-            "max_mm": most(&t.metres) * 1e3,
+            "max_mm": max(&t.metres) * 1e3,
             "mean_deg": mean(&t.radians).to_degrees(),
-            "max_deg": most(&t.radians).to_degrees(),
+            "max_deg": max(&t.radians).to_degrees(),
             "normalised_error_squared": t.pose_squares / (6.0 * t.poses.max(1) as f64),
         },
     })
 }
 
-fn words(line: &Value) -> String {
+fn summary(line: &Value) -> String {
     let f = |path: &str| line.pointer(path).and_then(Value::as_f64).unwrap_or(f64::NAN);
     let stages: Vec<String> =
         STAGES.iter().map(|s| format!("{s} {:.1}", f(&format!("/stage_us/{s}/median")))).collect();
     format!(
-        "{}: step {:.1} us median ({:.1} at 99 %, {:.1} best; {}), {} heap calls, {} marks, {} lost; error {:.4} px rms a \
+        "{}: step {:.1} us median ({:.1} at 99 %, {:.1} best; {}), {} heap calls, {} marks, {} lost; error {:.4} px rms per \
          coordinate, {:.4} mean, {:.4} max, normalised {:.2}; pose {:.4} mm, {:.4} deg mean, normalised {:.2}",
         line["condition"].as_str().unwrap_or_default(),
         f("/step_us/median"),

@@ -21,33 +21,33 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// Between two looks at the telemetry topic, which has 50 samples a second and keeps eight of them.
-const LOOK: Duration = Duration::from_millis(20);
-/// Without a sample for this long the daemon is gone.
-const SILENCE: Duration = Duration::from_secs(3);
+/// Poll period of the telemetry topic, which has 50 samples per second and buffers eight of them.
+const POLL_PERIOD: Duration = Duration::from_millis(20);
+/// Maximum time without a sample; after it the daemon is considered gone.
+const MAX_SILENCE: Duration = Duration::from_secs(3);
 
 /// `graspd calibrate gripper`.
 #[derive(Debug, Args)]
 pub struct CalibrateGripperArgs {
-    /// The recording: of `graspd calibrate record`, or of the form in docs/CALIBRATION.md
+    /// Recording, written by `graspd calibrate record` or in the format of docs/CALIBRATION.md
     #[arg(long, value_name = "FILE.json")]
     pub data: PathBuf,
-    /// Rig calibration in place of the recording's own; what it states of its own error is the prior
+    /// Rig calibration that replaces the recording's own; its stated error is the prior
     #[arg(long, value_name = "rig.toml")]
     pub rig: Option<PathBuf>,
     /// Gripper file whose marks and mounting are replaced in --out [default: the one inside the recording]
     #[arg(long, value_name = "gripper.toml")]
     pub gripper: Option<PathBuf>,
-    /// How well the task needs the marks to be known against the flange (one sigma), millimetres
+    /// Required accuracy of the marks in the flange frame (one sigma), millimetres
     #[arg(long, value_name = "MM", default_value_t = 1.0)]
     pub tolerance_mm: f64,
-    /// Where to write the calibrated gripper
+    /// Output file of the calibrated gripper
     #[arg(long, value_name = "gripper.toml")]
     pub out: Option<PathBuf>,
-    /// Where to write the rig, where the images say that it is off
+    /// Output file of the refined rig, written if the images show an error of the rig
     #[arg(long, value_name = "rig.toml")]
     pub rig_out: Option<PathBuf>,
-    /// One JSON object on standard output
+    /// Print one JSON object on the last line of standard output
     #[arg(long)]
     pub json: bool,
 }
@@ -58,16 +58,16 @@ pub struct CalibrateRecordArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
     pub client: ClientArgs,
-    /// Where to write the recording; it is complete after every rest
+    /// Output file of the recording; it is complete after every rest
     #[arg(long, value_name = "FILE.json")]
     pub out: PathBuf,
-    /// End after this many rests
+    /// Stop after this many rests
     #[arg(long, value_name = "N", default_value_t = 25)]
     pub rests: usize,
-    /// End after this many seconds
+    /// Stop after this many seconds
     #[arg(long, value_name = "S", default_value_t = 3600.0)]
     pub seconds: f64,
-    /// How well the marks' places in the gripper file are known (one sigma), millimetres [default: estimated]
+    /// Accuracy of the mark positions in the gripper file (one sigma), millimetres [default: estimated]
     #[arg(long, value_name = "MM")]
     pub marks_mm: Option<f64>,
 }
@@ -91,14 +91,16 @@ pub(super) fn gripper(args: &CalibrateGripperArgs) -> Result<Exit, Failure> {
 /// Runs `graspd calibrate record`.
 pub(super) fn record(args: &CalibrateRecordArgs) -> Result<Exit, Failure> {
     let usage = |message: &str| Failure { exit: Exit::Usage, message: message.to_owned() };
-    let path = args.client.config.as_deref().ok_or_else(|| {
-        usage("--config is needed: it names the cell, the arm, the rig and the gripper that are recorded")
-    })?;
+    let path = args
+        .client
+        .config
+        .as_deref()
+        .ok_or_else(|| usage("--config is required: it names the cell, the arm, the rig and the gripper"))?;
     if !(args.seconds > 0.0 && args.seconds <= 86_400.0) || args.rests == 0 || args.rests > 2000 {
-        return Err(usage("--seconds is 0 to 86400 and --rests 1 to 2000"));
+        return Err(usage("give --seconds above 0 and up to 86400, and --rests from 1 to 2000"));
     }
     if args.marks_mm.is_some_and(|v| !(0.0..=100.0).contains(&v)) {
-        return Err(usage("--marks-mm is a standard deviation from 0 to 100 millimetres"));
+        return Err(usage("give --marks-mm as a standard deviation from 0 to 100 millimetres"));
     }
     let config = Config::load(path)?;
     let (dh, source) = kinematics(&config)?;
@@ -108,10 +110,10 @@ pub(super) fn record(args: &CalibrateRecordArgs) -> Result<Exit, Failure> {
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         signal_hook::flag::register(signal, Arc::clone(&ended)).map_err(|e| Failure::fault(e.to_string()))?;
     }
-    say(
+    print_line(
         args,
         &format!(
-            "recording; kinematics: {source}. Move the arm by hand or pendant, and let it rest 1.5 s at each place."
+            "recording; kinematics: {source}. Move the arm by hand or pendant, and let it rest 1.5 s at each pose."
         ),
     );
     let mut recorder = Recorder::new(dh);
@@ -124,41 +126,44 @@ pub(super) fn record(args: &CalibrateRecordArgs) -> Result<Exit, Failure> {
             heard = Instant::now();
             match recorder.offer(sample_of(&sample)) {
                 Event::None => {}
-                Event::Passed(why) => say(args, &why),
+                Event::Skipped(why) => print_line(args, &why),
                 Event::Stored(n, [left, right]) => {
                     write(args, &config, &recorder)?;
-                    say(args, &format!("rest {n} of {}: {left} marks left, {right} right", args.rests));
+                    print_line(args, &format!("rest {n} of {}: {left} marks left, {right} marks right", args.rests));
                 }
             }
         }
-        if heard.elapsed() > SILENCE {
+        if heard.elapsed() > MAX_SILENCE {
             return Err(Failure::link(format!(
-                "no telemetry for {} s: is `graspd run` with this configuration running? {} rests are in {}",
-                SILENCE.as_secs(),
+                "no telemetry for {} s; check that `graspd run` is running with this configuration; {} rests are in {}",
+                MAX_SILENCE.as_secs(),
                 recorder.rests(),
                 args.out.display()
             )));
         }
-        std::thread::sleep(LOOK);
+        std::thread::sleep(POLL_PERIOD);
     }
     if args.client.json {
         let done = json!({ "rests": recorder.rests(), "out": args.out.display().to_string(), "kinematics": source });
         let _ = writeln!(std::io::stdout(), "{done}");
     }
     if recorder.rests() == 0 {
-        return Err(Failure::refused("nothing was recorded: no rest with three marks in both images"));
+        return Err(Failure::refused("no rest was recorded with three marks in both images"));
     }
-    say(args, &format!("{} rests; next: graspd calibrate gripper --data {}", recorder.rests(), args.out.display()));
+    print_line(
+        args,
+        &format!("{} rests; next: graspd calibrate gripper --data {}", recorder.rests(), args.out.display()),
+    );
     Ok(Exit::Done)
 }
 
-fn say(args: &CalibrateRecordArgs, words: &str) {
+fn print_line(args: &CalibrateRecordArgs, text: &str) {
     if !args.client.json {
-        let _ = writeln!(std::io::stdout(), "{words}");
+        let _ = writeln!(std::io::stdout(), "{text}");
     }
 }
 
-/// The table that the daemon itself uses, and where it is from.
+/// The kinematics that the daemon uses, and their source.
 fn kinematics(config: &Config) -> Result<(Dh, String), Failure> {
     match &config.arm.kinematics {
         Kinematics::File(path, dh) => Ok((**dh, path.display().to_string())),
@@ -168,7 +173,7 @@ fn kinematics(config: &Config) -> Result<(Dh, String), Failure> {
         }
         _ => Ok((
             config.arm.model.dh(),
-            format!("the {}'s published values, some millimetres off", config.arm.model.name()),
+            format!("published values of the {}, accurate to a few millimetres", config.arm.model.name()),
         )),
     }
 }
@@ -181,7 +186,7 @@ fn sample_of(t: &TelemetrySample) -> Sample {
     Sample { time_s: t.stamp_ns as f64 * 1e-9, q: t.q, qd: t.qd, marks: [view(0), view(1)] }
 }
 
-/// Writes what there is, through a neighbour and a rename.
+/// Writes the recording so far to a temporary file and renames it.
 fn write(args: &CalibrateRecordArgs, config: &Config, recorder: &Recorder) -> Result<(), Failure> {
     let stated: Value = args.marks_mm.map_or_else(|| json!({}), |mm| json!({ "mark_model_mm": mm }));
     let g = &config.gripper;
@@ -192,5 +197,5 @@ fn write(args: &CalibrateRecordArgs, config: &Config, recorder: &Recorder) -> Re
     part.push(".part");
     let part = Path::new(&part);
     let done = std::fs::write(part, text).and_then(|()| std::fs::rename(part, &args.out));
-    done.map_err(|e| Failure::input(format!("{}: cannot be written ({e}); choose another place", args.out.display())))
+    done.map_err(|e| Failure::input(format!("{}: cannot be written ({e}); choose another path", args.out.display())))
 }

@@ -1,12 +1,12 @@
-//! A recorded stereo sequence with its truth: cameras, marks, poses and images in plain files.
+//! A recorded stereo sequence with ground truth: cameras, marks, poses and images in plain files.
 //!
 //! | file | columns |
 //! |---|---|
-//! | `scene.json` | `conds`: the names of the conditions, with commas between them |
+//! | `scene.json` | `conds`: comma-separated names of the conditions |
 //! | `cameras.csv` | cam, width, height, fu, fv, u0, v0, camera from rig as r11..r33, tx, ty, tz; no distortion |
 //! | `marks.csv` | mark, centre x, y, z and unit normal in the gripper frame, radius (m) |
 //! | `poses.csv`, `goal_pose.csv` | frame, rig from gripper as r11..r33, tx, ty, tz |
-//! | `truth.csv` | frame, cam, mark, image of the disc's centre (u, v), then columns that are not read |
+//! | `truth.csv` | frame, cam, mark, image of the disc's centre (u, v), then columns that are ignored |
 //! | `CONDITION/camC/FFFFFF.pgm` | 8-bit images |
 
 use crate::exit::Failure;
@@ -21,7 +21,7 @@ pub(super) struct Image {
     pub(super) width: usize,
     /// Height in pixels.
     pub(super) height: usize,
-    /// Rows without gaps.
+    /// Grey values, row by row without padding.
     pub(super) grey: Vec<u8>,
 }
 
@@ -34,17 +34,17 @@ pub(super) struct Frame {
 /// A sequence without its images.
 pub(super) struct Sequence {
     root: PathBuf,
-    /// Names of the conditions: folders with the same motion in other light.
+    /// Names of the conditions: folders with the same motion under different lighting.
     pub(super) conditions: Vec<String>,
-    /// The cameras, the left one's frame being the rig's.
+    /// The cameras; the frame of the left one is the reference.
     pub(super) rig: Rig,
     /// The marks.
     pub(super) gripper: Gripper,
-    /// True poses, frame by frame.
+    /// True pose of each frame.
     pub(super) left_from_gripper: Vec<Pose>,
-    /// The pose that the law is asked to reach.
+    /// Goal pose of the control law.
     pub(super) goal: Pose,
-    /// True images of the discs' centres: frame, view, mark.
+    /// True projections of the disc centres, by frame, view and mark.
     pub(super) centres: Vec<[Vec<Pixel>; 2]>,
 }
 
@@ -52,13 +52,14 @@ impl Sequence {
     /// Reads everything but the images.
     ///
     /// # Errors
-    /// Names the file, the row and the column at fault.
+    /// A file that cannot be read or is invalid; the message gives the file and, for a bad row, the line.
     pub(super) fn read(root: &Path) -> Result<Self, Failure> {
         let scene = root.join("scene.json");
         let text = std::fs::read_to_string(&scene).map_err(|e| unreadable(&scene, &e.to_string()))?;
         let scene_json: serde_json::Value =
             serde_json::from_str(&text).map_err(|e| unreadable(&scene, &e.to_string()))?;
-        let names = scene_json["conds"].as_str().ok_or_else(|| unreadable(&scene, "no text under the key conds"))?;
+        let names =
+            scene_json["conds"].as_str().ok_or_else(|| unreadable(&scene, "the key conds has no string value"))?;
         let cameras = table(&root.join("cameras.csv"), 19, 2)?;
         let [left, right] = [camera(&cameras[0]), camera(&cameras[1])];
         let [left_from_rig, right_from_rig] = [pose(&cameras[0][7..]), pose(&cameras[1][7..])];
@@ -85,15 +86,15 @@ impl Sequence {
     /// Reads the images of one condition.
     ///
     /// # Errors
-    /// Names the image that cannot be read or has another size than its camera.
+    /// An image that cannot be read, or whose size differs from that of its camera.
     pub(super) fn frames(&self, condition: &str) -> Result<Vec<Frame>, Failure> {
-        let one = |k: usize, eye: usize, camera: &Camera| -> Result<Image, Failure> {
-            let file = self.root.join(condition).join(format!("cam{eye}")).join(format!("{k:06}.pgm"));
+        let one = |k: usize, index: usize, camera: &Camera| -> Result<Image, Failure> {
+            let file = self.root.join(condition).join(format!("cam{index}")).join(format!("{k:06}.pgm"));
             let image = image::open(&file).map_err(|e| unreadable(&file, &e.to_string()))?.into_luma8();
             let (w, h) = image.dimensions();
             if (w, h) != (camera.width, camera.height) {
-                let want = format!("{w}x{h} pixels, but cameras.csv says {}x{}", camera.width, camera.height);
-                return Err(unreadable(&file, &want));
+                let why = format!("image size mismatch: got {w}x{h}, expected {}x{}", camera.width, camera.height);
+                return Err(unreadable(&file, &why));
             }
             Ok(Image { width: w as usize, height: h as usize, grey: image.into_raw() })
         };
@@ -104,10 +105,10 @@ impl Sequence {
 }
 
 fn unreadable(file: &Path, why: &str) -> Failure {
-    Failure::input(format!("{}: {why}; give the folder of a recorded sequence", file.display()))
+    Failure::input(format!("{}: {why}; give the directory of a recorded sequence", file.display()))
 }
 
-/// Numbers of a CSV file with a header: at least `columns` in each of at least `rows` rows, all finite.
+/// Numbers of a CSV file with a header line: at least `rows` rows of at least `columns` finite numbers.
 fn table(file: &Path, columns: usize, rows: usize) -> Result<Vec<Vec<f64>>, Failure> {
     let text = std::fs::read_to_string(file).map_err(|e| unreadable(file, &e.to_string()))?;
     let mut all = Vec::new();
@@ -115,12 +116,12 @@ fn table(file: &Path, columns: usize, rows: usize) -> Result<Vec<Vec<f64>>, Fail
         let row: Result<Vec<f64>, _> = line.split(',').map(|v| v.trim().parse::<f64>()).collect();
         let row = row.map_err(|e| unreadable(file, &format!("line {}: {e}", k + 1)))?;
         if row.len() < columns || row.iter().any(|v| !v.is_finite()) {
-            return Err(unreadable(file, &format!("line {}: {columns} finite numbers are wanted", k + 1)));
+            return Err(unreadable(file, &format!("line {}: expected at least {columns} finite numbers", k + 1)));
         }
         all.push(row);
     }
     if all.len() < rows {
-        return Err(unreadable(file, &format!("{} rows, at least {rows} are wanted", all.len())));
+        return Err(unreadable(file, &format!("{} rows, expected at least {rows}", all.len())));
     }
     Ok(all)
 }
@@ -137,7 +138,7 @@ fn camera(row: &[f64]) -> Camera {
     }
 }
 
-/// A pose from nine entries of a rotation matrix, row by row, and a translation.
+/// A pose from the nine entries of a rotation matrix in row-major order and a translation.
 fn pose(v: &[f64]) -> Pose {
     let r = Matrix3::from_row_slice(&v[..9]);
     let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(r));

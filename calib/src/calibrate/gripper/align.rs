@@ -1,12 +1,12 @@
-//! Small closed forms: triangulation, alignment of point sets, and alignment that most of the points decide.
+//! Closed forms: triangulation, alignment of point sets, and robust alignment by consensus.
 
 use graspd_rt::geom::{Pixel, Pose, Rig, Vec3, View};
 use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion};
 
-/// Triples tried where there are too many to try all.
-const MOST_TRIPLES: usize = 300;
+/// Maximum number of triples; above it, this many random ones are tried.
+const MAX_TRIPLES: usize = 300;
 
-/// A generator of indices: the same sequence everywhere, which is all that consensus needs.
+/// A deterministic pseudo-random generator of indices.
 #[derive(Debug)]
 pub(super) struct Indices(pub(super) u64);
 
@@ -17,7 +17,7 @@ impl Indices {
         ((self.0 >> 33) as usize) % n.max(1)
     }
 
-    /// Three different indices below `n`, which is at least 3.
+    /// Three distinct indices below `n`; `n` is at least 3.
     pub(super) fn three(&mut self, n: usize) -> [usize; 3] {
         let a = self.below(n);
         let b = (a + 1 + self.below(n - 1)) % n;
@@ -30,7 +30,8 @@ impl Indices {
     }
 }
 
-/// Middle of the shortest link between the rays of two pixels, left frame, metres; `None` where there is no ray.
+/// Midpoint of the shortest segment between the rays of two pixels, left frame, metres; `None` for a pixel without a
+/// ray and for almost parallel rays.
 pub(super) fn triangulate(rig: &Rig, px: [Pixel; 2]) -> Option<Vec3> {
     let a = rig.left.ray(px[0])?;
     let left_from_right = rig.right_from_left.inverse();
@@ -38,7 +39,7 @@ pub(super) fn triangulate(rig: &Rig, px: [Pixel; 2]) -> Option<Vec3> {
     let t = rig.centre(View::Right);
     let (ab, at, bt) = (a.dot(&b), a.dot(&t), b.dot(&t));
     let den = 1.0 - ab * ab;
-    // Rays within a milliradian of each other meet at a thousand baselines.
+    // Rays within 1 mrad of parallel intersect at a thousand baselines.
     if den < 1e-6 {
         return None;
     }
@@ -46,14 +47,14 @@ pub(super) fn triangulate(rig: &Rig, px: [Pixel; 2]) -> Option<Vec3> {
     Some((a * s + t + b * u) * 0.5)
 }
 
-/// Rotation that takes the directions `from` to `to` best (no centring).
+/// Least-squares rotation from the directions `from` to `to` (no centring).
 pub(super) fn rotation(pairs: impl Iterator<Item = (Vec3, Vec3)>) -> Option<UnitQuaternion<f64>> {
     let mut m = Matrix3::zeros();
     pairs.for_each(|(from, to)| m += to * from.transpose());
     proper(&m)
 }
 
-/// The rotation nearest to `m`, in the trace's sense.
+/// The rotation R that maximizes tr(Rᵀ m).
 fn proper(m: &Matrix3<f64>) -> Option<UnitQuaternion<f64>> {
     if m.iter().any(|v| !v.is_finite()) {
         return None;
@@ -67,7 +68,7 @@ fn proper(m: &Matrix3<f64>) -> Option<UnitQuaternion<f64>> {
     Some(UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(u * d * v)))
 }
 
-/// Pose and scale that take `from` to `to` best: to = pose · (scale · from). `scale` is 1 where it is held.
+/// Least-squares pose and scale from `from` to `to`: to = pose · (scale · from). `scale` is 1 unless `free_scale`.
 pub(super) fn similarity(pairs: &[(Vec3, Vec3)], free_scale: bool) -> Option<(Pose, f64)> {
     if pairs.len() < 3 {
         return None;
@@ -85,7 +86,7 @@ pub(super) fn similarity(pairs: &[(Vec3, Vec3)], free_scale: bool) -> Option<(Po
     scale.is_finite().then(|| (Pose::from_parts(Translation3::from(b - r * (a * scale)), r), scale))
 }
 
-/// Pose that takes `from` to `to` by the triple whose median distance over all pairs is smallest, and that median.
+/// Pose from `from` to `to` of the triple with the smallest median distance over all pairs, and that median.
 pub(super) fn consensus(pairs: &[(Vec3, Vec3)]) -> Option<(Pose, f64)> {
     let n = pairs.len();
     if n < 3 {
@@ -96,7 +97,7 @@ pub(super) fn consensus(pairs: &[(Vec3, Vec3)]) -> Option<(Pose, f64)> {
     for t in triples(n) {
         let three = t.map(|i| pairs[i]);
         let [a, b, c] = three.map(|p| p.0);
-        // Three points on a line leave a turn open: a twentieth of the triangle's longer sides is too flat.
+        // Three collinear points leave a rotation undetermined: the minimum height is a twentieth of the longer side.
         if (b - a).cross(&(c - a)).norm() < 0.05 * (b - a).norm_squared().max((c - a).norm_squared()) {
             continue;
         }
@@ -111,16 +112,16 @@ pub(super) fn consensus(pairs: &[(Vec3, Vec3)]) -> Option<(Pose, f64)> {
     best
 }
 
-/// All triples below `n`, or as many drawn ones as are worth trying.
+/// All triples of indices below `n`, or `MAX_TRIPLES` random ones.
 pub(super) fn triples(n: usize) -> Vec<[usize; 3]> {
-    if n * (n - 1) * (n - 2) / 6 <= MOST_TRIPLES {
+    if n * (n - 1) * (n - 2) / 6 <= MAX_TRIPLES {
         return (0..n).flat_map(|a| (a + 1..n).flat_map(move |b| (b + 1..n).map(move |c| [a, b, c]))).collect();
     }
     let mut draw = Indices(1);
-    (0..MOST_TRIPLES).map(|_| draw.three(n)).collect()
+    (0..MAX_TRIPLES).map(|_| draw.three(n)).collect()
 }
 
-/// The median (the upper one of an even number); infinity of nothing.
+/// The median (the upper one for an even number of values); infinity for an empty slice.
 pub(super) fn median(values: &mut [f64]) -> f64 {
     if values.is_empty() {
         return f64::INFINITY;

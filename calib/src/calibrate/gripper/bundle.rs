@@ -1,4 +1,4 @@
-//! The likelihood of one hypothesis: its objective, its weights and its normal equations with analytic derivatives.
+//! The likelihood of one hypothesis: objective, weights, and normal equations with analytic derivatives.
 
 use super::data::Recording;
 use super::rig_prior::{RigChange, RigPrior, moved, project, skew};
@@ -6,15 +6,15 @@ use graspd_rt::geom::{Pixel, Pose, Rig, Vec3, View, exp_twist};
 use nalgebra::{DMatrix, DVector, Matrix2x3, Matrix2x6, Matrix3, Matrix6, Vector6};
 use std::f64::consts::TAU;
 
-/// A pose of another origin than the rest: the arm moved between image and joints, another tool point. One tenth of a
-/// metre and 0.2 rad.
-const FOREIGN: [f64; 2] = [0.1, 0.2];
-/// What is known of the gripper's place before any image: within a metre of the flange, in any orientation.
-const GRIPPER_PRIOR: [f64; 2] = [1.0, std::f64::consts::PI];
-/// The same of the rig's place: within ten metres of the base.
-const RIG_PRIOR: [f64; 2] = [10.0, std::f64::consts::PI];
+/// Standard deviations of the flange error of an outlier pose (the arm moved between image and joints, or the pose is
+/// that of another tool point): metres and rad.
+const OUTLIER_POSE_SIGMA: [f64; 2] = [0.1, 0.2];
+/// Prior standard deviations of the gripper's pose on the flange: 1 m, any orientation (rad).
+const GRIPPER_POSE_SIGMA: [f64; 2] = [1.0, std::f64::consts::PI];
+/// Prior standard deviations of the rig's pose in the base frame: 10 m, any orientation (rad).
+const RIG_POSE_SIGMA: [f64; 2] = [10.0, std::f64::consts::PI];
 
-/// Unknowns of flange_from_gripper and base_from_left.
+/// Number of unknowns of flange_from_gripper and base_from_left.
 pub(super) const POSES: usize = 12;
 
 /// One sighting in one view.
@@ -29,13 +29,13 @@ pub(super) struct Row {
 #[derive(Debug)]
 pub(super) struct Model<'a> {
     pub(super) rec: &'a Recording,
-    /// Sightings, a list a pose.
+    /// Sightings, one list per pose.
     pub(super) rows: Vec<Vec<Row>>,
     /// The rig's unknowns.
     pub(super) prior: RigPrior,
     /// Whether the marks are unknowns.
     pub(super) free_marks: bool,
-    /// Pixels an erroneous sighting may lie on.
+    /// Area over which gross errors are uniformly distributed, pixels.
     area: f64,
 }
 
@@ -48,13 +48,13 @@ pub(super) struct State {
     pub(super) y: Pose,
     /// Marks in the gripper's frame, metres.
     pub(super) marks: Vec<Vec3>,
-    /// For each pose, reported flange from true flange.
+    /// Flange correction of each pose, reported from true flange.
     pub(super) flange: Vec<Pose>,
-    /// The rig's unknowns, in deviations of the prior.
+    /// The rig's unknowns, in standard deviations of the prior.
     pub(super) u: DVector<f64>,
 }
 
-/// Standard deviations and shares in force.
+/// Current standard deviations and outlier fractions.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Scales {
     pub(super) px: f64,
@@ -62,10 +62,11 @@ pub(super) struct Scales {
     pub(super) flange_rad: f64,
     pub(super) marks_m: f64,
     pub(super) outliers: f64,
-    pub(super) foreign: f64,
+    pub(super) outlier_poses: f64,
 }
 
-/// Normal equations: global block, a block a pose, and what couples them; right sides are the negative gradient.
+/// Normal equations: global block `h`, one block `a` per pose, coupling blocks `b`; the right-hand sides `g` and `c`
+/// are the negative gradient.
 #[derive(Debug)]
 pub(super) struct Normal {
     pub(super) h: DMatrix<f64>,
@@ -73,9 +74,9 @@ pub(super) struct Normal {
     pub(super) a: Vec<Matrix6<f64>>,
     pub(super) b: Vec<DMatrix<f64>>,
     pub(super) c: Vec<Vector6<f64>>,
-    /// For each row the probability that it is no gross error, and its squared residual in pixels.
+    /// Inlier probability and squared residual (px²) of each row.
     pub(super) rows: Vec<Vec<(f64, f64)>>,
-    /// For each pose the probability that its flange error is the arm's ordinary noise.
+    /// Probability that the flange error of each pose is the arm's ordinary noise.
     pub(super) ordinary: Vec<f64>,
 }
 
@@ -91,7 +92,7 @@ impl<'a> Model<'a> {
         Self { rec, rows: rows.collect(), prior, free_marks, area }
     }
 
-    /// Number of global unknowns.
+    /// Number of global unknowns: poses, marks and rig.
     pub(super) fn globals(&self) -> usize {
         POSES + self.mark_unknowns() + self.prior.unknowns()
     }
@@ -100,7 +101,7 @@ impl<'a> Model<'a> {
         if self.free_marks { 3 * self.rec.marks.len() } else { 0 }
     }
 
-    /// The rig of a state.
+    /// The rig at a state.
     pub(super) fn rig(&self, s: &State) -> Rig {
         if self.prior.unknowns() == 0 {
             return self.rec.rig;
@@ -109,7 +110,7 @@ impl<'a> Model<'a> {
         moved(&self.rec.rig, &RigChange::from_column_slice(d.as_slice()))
     }
 
-    /// Negative logarithm of likelihood times priors.
+    /// Negative logarithm of the likelihood times the priors.
     pub(super) fn objective(&self, s: &State, k: &Scales) -> f64 {
         let rig = self.rig(s);
         let mut f = 0.0;
@@ -134,12 +135,12 @@ impl<'a> Model<'a> {
         (1.0 - k.outliers) * normal2(r2, k.px) + k.outliers / self.area
     }
 
-    /// Probability that a sighting with this squared residual is no gross error.
+    /// Inlier probability of a sighting with this squared residual.
     fn inlier(&self, r2: f64, k: &Scales) -> f64 {
         (1.0 - k.outliers) * normal2(r2, k.px) / self.density(r2, k)
     }
 
-    /// Normal equations at a state, each sighting weighted by the probability that it is no gross error.
+    /// Normal equations at a state, with each sighting weighted by its inlier probability.
     pub(super) fn normal(&self, s: &State, k: &Scales) -> Normal {
         let (g, n) = (self.globals(), self.rows.len());
         let rig = self.rig(s);
@@ -202,11 +203,10 @@ impl<'a> Model<'a> {
             let (w, _) = flange_density(e, k);
             out.ordinary.push(w);
             let of = |near: f64, far: f64| w / (near * near) + (1.0 - w) / (far * far);
-            let (it, ir) = (of(k.flange_m, FOREIGN[0]), of(k.flange_rad, FOREIGN[1]));
+            let (it, ir) = (of(k.flange_m, OUTLIER_POSE_SIGMA[0]), of(k.flange_rad, OUTLIER_POSE_SIGMA[1]));
             let t = e.translation.vector;
             let r = e.rotation.scaled_axis();
-            // The unknowns are a turn and a shift in the corrected flange's own axes: d(t) = R v, d(r) = (1 + [r]x / 2)
-            // w.
+            // The unknowns (v, w) are a twist in the axes of the corrected flange: d(t) = R v, d(r) = (1 + [r]x / 2) w.
             let turn = *e.rotation.to_rotation_matrix().matrix();
             let by = Matrix3::identity() + skew(&r) * 0.5;
             for m in 0..3 {
@@ -234,9 +234,9 @@ impl<'a> Model<'a> {
             out.h[(first + j, first + j)] += 1.0;
             out.g[first + j] -= s.u[j];
         }
-        // The poses' own priors pull nowhere; they only keep what no motion shows finite.
+        // The priors of the poses have no gradient; they only keep the variance of unobserved directions finite.
         for j in 0..POSES {
-            let sd = if j < 6 { GRIPPER_PRIOR } else { RIG_PRIOR }[(j % 6) / 3];
+            let sd = if j < 6 { GRIPPER_POSE_SIGMA } else { RIG_POSE_SIGMA }[(j % 6) / 3];
             out.h[(j, j)] += 1.0 / (sd * sd);
         }
     }
@@ -262,7 +262,7 @@ impl<'a> Model<'a> {
     }
 }
 
-/// A pixel's derivatives by everything it depends on.
+/// Derivatives of a pixel by all unknowns.
 struct Derivatives {
     px: Pixel,
     x: Matrix2x6<f64>,
@@ -272,7 +272,7 @@ struct Derivatives {
     rig: nalgebra::SMatrix<f64, 2, { super::rig_prior::RIG_PARAMETERS }>,
 }
 
-/// Derivative by a screw (v, w) of the frame in which `point` stands: the point moves by v + w x point.
+/// Derivative by a twist (v, w) of the frame in which `point` is given: the point moves by v + w x point.
 fn screw(by_point: &Matrix2x3<f64>, point: &Vec3) -> Matrix2x6<f64> {
     let mut j = Matrix2x6::zeros();
     j.fixed_view_mut::<2, 3>(0, 0).copy_from(by_point);
@@ -281,12 +281,12 @@ fn screw(by_point: &Matrix2x3<f64>, point: &Vec3) -> Matrix2x6<f64> {
 }
 
 impl State {
-    /// The gripper in the left camera at a pose.
+    /// The gripper's pose in the left camera at pose `i`.
     pub(super) fn left_from_gripper(&self, base_from_reported: &Pose, i: usize) -> Pose {
         self.y.inv_mul(base_from_reported) * self.flange[i] * self.x
     }
 
-    /// The state a step further.
+    /// The state after a step.
     pub(super) fn stepped(&self, global: &DVector<f64>, local: &[Vector6<f64>], model: &Model<'_>) -> Self {
         let six = |at: usize| exp_twist(&Vector6::from_fn(|r, _| global[at + r]));
         let mut out = self.clone();
@@ -314,22 +314,25 @@ fn normal2(r2: f64, sigma: f64) -> f64 {
     (-0.5 * r2 / v).exp() / (TAU * v)
 }
 
-/// Logarithms of the two parts of a flange error's density.
+/// Logarithms of the two components of a flange error's density: ordinary noise and outlier.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct TwoParts(f64, f64);
 
 impl TwoParts {
     /// Logarithm of the sum.
     pub(super) fn ln_sum(self) -> f64 {
-        let most = self.0.max(self.1);
-        most + ((self.0 - most).exp() + (self.1 - most).exp()).ln()
+        let max = self.0.max(self.1);
+        max + ((self.0 - max).exp() + (self.1 - max).exp()).ln()
     }
 }
 
 /// Probability that a flange error is the arm's ordinary noise, and the logarithms of both densities.
 fn flange_density(e: &Pose, k: &Scales) -> (f64, TwoParts) {
     let (t2, r2) = (e.translation.vector.norm_squared(), e.rotation.scaled_axis().norm_squared());
-    let log = |share: f64, t: f64, r: f64| share.ln() - 3.0 * (TAU * t * r).ln() - 0.5 * (t2 / (t * t) + r2 / (r * r));
-    let parts = TwoParts(log(1.0 - k.foreign, k.flange_m, k.flange_rad), log(k.foreign, FOREIGN[0], FOREIGN[1]));
+    let log = |p: f64, t: f64, r: f64| p.ln() - 3.0 * (TAU * t * r).ln() - 0.5 * (t2 / (t * t) + r2 / (r * r));
+    let parts = TwoParts(
+        log(1.0 - k.outlier_poses, k.flange_m, k.flange_rad),
+        log(k.outlier_poses, OUTLIER_POSE_SIGMA[0], OUTLIER_POSE_SIGMA[1]),
+    );
     ((parts.0 - parts.ln_sum()).exp(), parts)
 }

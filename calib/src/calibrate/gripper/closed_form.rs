@@ -1,34 +1,34 @@
-//! The start of the fit: hand-eye calibration in closed form, on the motions that most of the poses agree about.
+//! Initial estimate of the fit: closed-form hand-eye calibration with a consensus over the poses.
 //!
-//! Between two rests the flange moves by A and the gripper, as the cameras see it, by B, and A X = X B with X =
-//! `flange_from_gripper`. The rotation follows from the logarithms, α = R β (Park and Martin 1994); then, with a scale
-//! s between the arm's lengths and the cameras' that shows a wrong unit, (R_A - 1) t = s R t_B - t_A is linear. Triples
-//! of poses propose, the median distance of the marks over all poses decides, so that up to half of the poses may be
-//! wrong. Where all turns share one axis, R is open about it: a fan of angles is tried, since translations may decide;
-//! where nothing turns, they alone do.
+//! Between two rests the flange moves by A and the gripper, seen by the cameras, by B, and A X = X B with X =
+//! `flange_from_gripper`. The rotation follows from the logarithms, α = R β (Park and Martin 1994). With a scale s
+//! between the lengths of the arm and of the cameras, which reveals a wrong unit, (R_A - 1) t = s R t_B - t_A is
+//! linear. Each triple of poses gives a candidate; the one with the smallest median distance of the marks over all
+//! poses wins, so up to half of the poses may be wrong. If all rotations share one axis, R is undetermined about it: a
+//! fan of angles is tried, because the translations may resolve it. Without any rotation, R follows from the
+//! translations alone.
 
 use super::align::{Indices, median, rotation};
 use graspd_rt::geom::{Pose, Vec3};
 use nalgebra::{DMatrix, DVector, Matrix3, SymmetricEigen, Translation3, Unit, UnitQuaternion};
 
-/// Triples of poses tried: one of three good ones among poses of which half are wrong is missed with (7/8)^200 = 3e-12.
-const TRIES: usize = 200;
-/// Turns about a second axis below this (root mean square, rad) are not told from the noise of a gripper seen by
-/// cameras.
-const LEAST_TURN: f64 = 0.017;
-/// Angles of the fan about a common axis.
-const FAN: usize = 24;
-/// What is known of the gripper's place on the flange in the linear step: within 0.3 m, against a noise of one
-/// millimetre.
+/// Number of random triples of poses: with half of the poses wrong, the probability that no triple is entirely correct
+/// is (7/8)^200 = 3e-12.
+const TRIPLES: usize = 200;
+/// Minimum rotation about an axis (root mean square, rad): smaller ones are within the noise of the camera poses.
+const MIN_TURN_RAD: f64 = 0.017;
+/// Number of angles of the fan about a common axis.
+const FAN_ANGLES: usize = 24;
+/// Prior of the gripper's position on the flange in the linear step: noise of 1 mm relative to a prior of 0.3 m.
 const RIDGE: f64 = 1e-3 / 0.3;
-/// Most pairs of poses in the final step.
-const MOST_PAIRS: usize = 4000;
-/// Poses further than this many medians from the consensus take no part in the final step.
-const WITHIN: f64 = 4.0;
-/// Poses further than this many medians start with a correction of their own; the likelihood decides.
-const FAR: f64 = 8.0;
+/// Maximum number of pose pairs in the final step.
+const MAX_PAIRS: usize = 4000;
+/// Maximum distance of a pose from the consensus, in medians, in the final step.
+const MAX_INLIER_MEDIANS: f64 = 4.0;
+/// Maximum distance of a pose from the consensus, in medians, without an initial flange correction.
+const MAX_UNCORRECTED_MEDIANS: f64 = 8.0;
 
-/// A rest: flange in the base, gripper in the left camera.
+/// A rest: flange pose in the base frame, gripper pose in the left camera.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Rest {
     /// Index in the recording.
@@ -37,20 +37,21 @@ pub(super) struct Rest {
     pub(super) view: Pose,
 }
 
-/// A solution in closed form.
+/// A closed-form solution.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct HandEye {
     /// `flange_from_gripper`.
     pub(super) x: Pose,
     /// `base_from_left`.
     pub(super) y: Pose,
-    /// Lengths of the arm over lengths of the cameras.
+    /// Ratio of the arm's lengths to the cameras' lengths.
     pub(super) scale: f64,
-    /// Median over the poses of the marks' distance from where the solution puts them, in the arm's lengths, metres.
+    /// Median over the poses of the distance between predicted and seen marks, in the arm's lengths, metres.
     pub(super) median_m: f64,
 }
 
-/// Solves; `marks` only weigh rotation against translation. `None` for fewer than two poses.
+/// Solves for X and Y; `marks` only set the relative weight of rotation and translation. `None` for fewer than two
+/// poses.
 pub(super) fn solve(rests: &[Rest], marks: &[Vec3], free_scale: bool) -> Option<HandEye> {
     let n = rests.len();
     if n < 2 {
@@ -59,16 +60,16 @@ pub(super) fn solve(rests: &[Rest], marks: &[Vec3], free_scale: bool) -> Option<
     let mut draw = Indices(7);
     let mut best: Option<HandEye> = None;
     let samples: Vec<Vec<usize>> =
-        if n < 4 { vec![(0..n).collect()] } else { (0..TRIES).map(|_| draw.three(n).to_vec()).collect() };
+        if n < 4 { vec![(0..n).collect()] } else { (0..TRIPLES).map(|_| draw.three(n).to_vec()).collect() };
     for sample in samples {
         let chosen: Vec<Rest> = sample.iter().map(|&i| rests[i]).collect();
         best = better(best, from_rests(&chosen, rests, marks, free_scale));
     }
-    // The pose set of the consensus, enlarged and solved anew; it has to be at least as good.
+    // Solve again with all inliers of the consensus; the result is kept only if it is better.
     for _ in 0..3 {
         let now = best?;
         let good: Vec<Rest> =
-            rests.iter().copied().filter(|r| now.distance(r, marks) <= WITHIN * now.median_m).collect();
+            rests.iter().copied().filter(|r| now.distance(r, marks) <= MAX_INLIER_MEDIANS * now.median_m).collect();
         best = better(best, from_rests(&good, rests, marks, free_scale));
     }
     best
@@ -84,7 +85,7 @@ fn better(a: Option<HandEye>, b: Option<HandEye>) -> Option<HandEye> {
 /// Relative motions (A, B) between the chosen rests.
 fn motions(rests: &[Rest]) -> Vec<(Pose, Pose)> {
     let n = rests.len();
-    let stride = (n * (n.max(1) - 1) / 2).div_ceil(MOST_PAIRS).max(1);
+    let stride = (n * (n.max(1) - 1) / 2).div_ceil(MAX_PAIRS).max(1);
     let pairs = (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j))).step_by(stride);
     pairs.map(|(i, j)| (rests[i].flange.inv_mul(&rests[j].flange), rests[i].view.inv_mul(&rests[j].view))).collect()
 }
@@ -105,16 +106,17 @@ fn from_rests(chosen: &[Rest], all: &[Rest], marks: &[Vec3], free_scale: bool) -
 }
 
 impl HandEye {
-    /// First flange correction of a rest: none for one of the consensus, what the cameras say for one that is far from
-    /// it. Without it all sightings of such a rest would look like gross errors.
+    /// Initial flange correction of a rest: identity for an inlier, the correction from the cameras for an outlier.
+    /// Without it the fit would classify all sightings of such a rest as gross errors.
     pub(super) fn correction(&self, r: &Rest, marks: &[Vec3]) -> Pose {
-        if self.distance(r, marks) <= FAR * self.median_m {
+        if self.distance(r, marks) <= MAX_UNCORRECTED_MEDIANS * self.median_m {
             return Pose::identity();
         }
         r.flange.inverse() * self.y * scaled(&r.view, self.scale) * self.x.inverse()
     }
 
-    /// Root mean square distance of the marks at a rest between both ways around, metres of the arm.
+    /// Root mean square distance at a rest between the marks predicted by the arm and those seen by the cameras, in the
+    /// arm's lengths, metres.
     pub(super) fn distance(&self, r: &Rest, marks: &[Vec3]) -> f64 {
         let (around, direct) = (self.y.inv_mul(&r.flange) * self.x, scaled(&r.view, self.scale));
         let d = |m: &Vec3| {
@@ -129,7 +131,7 @@ fn scaled(p: &Pose, by: f64) -> Pose {
     Pose::from_parts(Translation3::from(p.translation.vector * by), p.rotation)
 }
 
-/// Rotations that the motions allow: one, or a fan about the only axis of turning.
+/// Candidate rotations: one, or a fan about the only rotation axis.
 fn rotations(motions: &[(Pose, Pose)]) -> Option<Vec<UnitQuaternion<f64>>> {
     let logs: Vec<(Vec3, Vec3)> =
         motions.iter().map(|(a, b)| (b.rotation.scaled_axis(), a.rotation.scaled_axis())).collect();
@@ -138,21 +140,21 @@ fn rotations(motions: &[(Pose, Pose)]) -> Option<Vec<UnitQuaternion<f64>>> {
     let mut order = [0, 1, 2];
     order.sort_by(|&i, &j| eigen.eigenvalues[j].total_cmp(&eigen.eigenvalues[i]));
     let turn = |k: usize| eigen.eigenvalues[order[k]].max(0.0).sqrt();
-    if turn(0) < LEAST_TURN {
-        // Nothing turns: directions of travel are all there is.
+    if turn(0) < MIN_TURN_RAD {
+        // No rotation: only the directions of the translations are available.
         let r = rotation(motions.iter().map(|(a, b)| (b.translation.vector, a.translation.vector)))?;
         return Some(vec![r]);
     }
-    if turn(1) >= LEAST_TURN {
+    if turn(1) >= MIN_TURN_RAD {
         return Some(vec![rotation(logs.into_iter())?]);
     }
     let axis = Unit::new_normalize(eigen.eigenvectors.column(order[0]).into_owned());
     let first = rotation(logs.into_iter())?;
-    let angle = |k: usize| UnitQuaternion::from_axis_angle(&axis, std::f64::consts::TAU * k as f64 / FAN as f64);
-    Some((0..FAN).map(|k| first * angle(k)).collect())
+    let angle = |k: usize| UnitQuaternion::from_axis_angle(&axis, std::f64::consts::TAU * k as f64 / FAN_ANGLES as f64);
+    Some((0..FAN_ANGLES).map(|k| first * angle(k)).collect())
 }
 
-/// Translation and scale for a rotation, by least squares with a weak hold on both.
+/// Translation and scale for a rotation, by least squares with weak regularization.
 fn translation(motions: &[(Pose, Pose)], r: &UnitQuaternion<f64>, free_scale: bool) -> Option<(Vec3, f64)> {
     let columns = if free_scale { 4 } else { 3 };
     let mut h = DMatrix::<f64>::zeros(columns, columns);
@@ -183,7 +185,7 @@ fn translation(motions: &[(Pose, Pose)], r: &UnitQuaternion<f64>, free_scale: bo
     (scale > 0.0 && scale.is_finite()).then(|| (Vec3::new(s[0], s[1], s[2]), scale))
 }
 
-/// Mean of poses: rotations by the mean of their matrices.
+/// Mean pose; the rotation is the projected mean of the rotation matrices.
 fn mean(poses: impl Iterator<Item = Pose>) -> Option<Pose> {
     let (mut m, mut t, mut n) = (Matrix3::zeros(), Vec3::zeros(), 0.0);
     for p in poses {

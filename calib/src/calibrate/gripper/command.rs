@@ -1,5 +1,5 @@
-//! `graspd calibrate gripper` without the command line: paths and options in, files and figures out, every failure in
-//! words.
+//! `graspd calibrate gripper` without the command-line parser: takes paths and options, writes files, and returns text,
+//! JSON and an exit code. Every failure has a message.
 
 use super::error::GripperError;
 use super::report::{Verdict, refusal_json};
@@ -9,24 +9,24 @@ use crate::files::{GripperFile, RigFile};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// What `graspd calibrate gripper` is asked.
+/// Options of `graspd calibrate gripper`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct GripperRequest {
     /// The recording.
     pub data: PathBuf,
-    /// A rig in place of the recording's own.
+    /// Rig that replaces the recording's own.
     pub rig: Option<PathBuf>,
-    /// The gripper file whose marks and mounting are to be replaced; the recording's own where not given.
+    /// Gripper file whose marks and mounting are replaced; by default the recording's own.
     pub gripper: Option<PathBuf>,
-    /// Standard deviation of the marks against the flange that the task tolerates, millimetres.
+    /// Tolerated standard deviation of the marks in the flange frame, millimetres.
     pub tolerance_mm: f64,
-    /// Where to write the gripper.
+    /// Output file of the gripper.
     pub out: Option<PathBuf>,
-    /// Where to write the rig, where it was refined.
+    /// Output file of the rig, written if it was refined.
     pub rig_out: Option<PathBuf>,
 }
 
-/// Runs it.
+/// Runs the calibration.
 pub fn calibrate_gripper(r: &GripperRequest) -> Outcome {
     run(r).unwrap_or_else(|(answer, text, json)| Outcome { answer, text, json })
 }
@@ -41,7 +41,7 @@ fn input(e: impl std::fmt::Display) -> Failure {
 
 fn run(r: &GripperRequest) -> Result<Outcome, Failure> {
     if !(r.tolerance_mm > 0.0 && r.tolerance_mm <= 1000.0) {
-        let text = format!("--tolerance-mm {} is not a number of millimetres from 0 to 1000", r.tolerance_mm);
+        let text = format!("--tolerance-mm {}: give more than 0 and at most 1000", r.tolerance_mm);
         return Err((Answer::Usage, text.clone(), json!({ "verdict": "refused", "reason": text, "findings": [] })));
     }
     let tolerance = r.tolerance_mm * 1e-3;
@@ -55,7 +55,7 @@ fn run(r: &GripperRequest) -> Result<Outcome, Failure> {
     if let Some(t) = &template {
         if t.gripper.marks.len() != rec.marks.len() {
             let text = format!(
-                "{}: {} marks, but the gripper file has {}; they do not belong together",
+                "{}: {} marks, but the gripper file has {}; give the gripper file of this recording",
                 rec.name,
                 rec.marks.len(),
                 t.gripper.marks.len()
@@ -71,12 +71,12 @@ fn run(r: &GripperRequest) -> Result<Outcome, Failure> {
         };
         (answer, e.to_string(), refusal_json(&e))
     })?;
-    let mut text = s.words(&rec, tolerance);
+    let mut text = s.to_text(&rec, tolerance);
     let json = s.to_json(&rec, tolerance);
     let verdict = s.verdict(tolerance);
     if verdict != Verdict::Good {
         if r.out.is_some() {
-            text.push_str("\nNothing was written.");
+            text.push_str("\nNo file was written.");
         }
         return Ok(Outcome { answer: Answer::Refused, text, json });
     }
@@ -94,7 +94,7 @@ fn run(r: &GripperRequest) -> Result<Outcome, Failure> {
 
 fn write_rig(path: &Path, given: Option<RigFile>, s: &super::Solution) -> Result<String, Failure> {
     if s.hypothesis.rig_scale == 0.0 {
-        return Ok(format!("\n{} was not written: the rig is as it was given.", path.display()));
+        return Ok(format!("\n{} was not written: the rig is unchanged.", path.display()));
     }
     let name = given.and_then(|g| g.name);
     RigFile { name, ..RigFile::new(s.rig) }.save(path).map_err(input)?;

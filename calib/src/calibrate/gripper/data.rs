@@ -1,34 +1,34 @@
-//! A recording: what was seen of the marks while the arm stood in many poses, and what is known about its noise.
+//! A recording: mark sightings at the rests of the arm, and the noise model.
 
 use super::rig_prior::RigPrior;
 use graspd_rt::geom::{Pixel, Pose, Rig, Vec3};
 
-/// One mark at one rest of the arm.
+/// One mark at one rest.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sighting {
     /// Index of the mark in [`Recording::marks`].
     pub mark: usize,
-    /// Pixel in the left and the right image; `None` where it was not seen.
+    /// Pixel in the left and the right image; `None` if not detected.
     pub px: [Option<Pixel>; 2],
 }
 
 /// One rest of the arm.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ArmPose {
-    /// Flange in the base, as the arm reported it.
+    /// Flange pose in the base frame, as reported by the arm.
     pub base_from_flange: Pose,
-    /// What the pendant reported as its tool point, where that was recorded as well.
+    /// Tool point as reported by the pendant, if recorded.
     pub base_from_tcp: Option<Pose>,
-    /// Joint positions, rad, where they were recorded.
+    /// Joint positions, rad, if recorded.
     pub joints: Option<[f64; 6]>,
-    /// The marks seen.
+    /// Detected marks.
     pub marks: Vec<Sighting>,
 }
 
-/// A standard deviation, and whether somebody stated it or it is a default.
+/// A standard deviation, either stated by the recording or a default.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sigma {
-    /// Standard deviation of each axis.
+    /// Standard deviation per axis.
     pub value: f64,
     /// Whether the recording states it.
     pub stated: bool,
@@ -37,20 +37,20 @@ pub struct Sigma {
 /// Standard deviations, per axis.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Noise {
-    /// Flange position against what the arm reports, in the flange's frame, metres.
+    /// Error of the reported flange position, in the flange's frame, metres.
     pub flange_m: Sigma,
-    /// Flange orientation, rad.
+    /// Error of the reported flange orientation, rad.
     pub flange_rad: Sigma,
     /// Mark centre in an image, pixels.
     pub mark_px: Sigma,
-    /// Nominal mark position against the true one (machining), metres; zero where the marks are known exactly.
+    /// Error of the nominal mark position (machining), metres; zero if the marks are known exactly.
     pub marks_m: Sigma,
-    /// Share of sightings that are gross errors.
+    /// Fraction of sightings that are gross errors.
     pub outliers: f64,
 }
 
 impl Default for Noise {
-    /// An industrial arm's repeatability and the project's own mark finder; marks machined or glued by hand.
+    /// Repeatability of an industrial arm, noise of this project's mark detector, marks machined or glued by hand.
     fn default() -> Self {
         let unknown = |value| Sigma { value, stated: false };
         Self {
@@ -63,22 +63,22 @@ impl Default for Noise {
     }
 }
 
-/// Everything a calibration is made from.
+/// Input of a calibration.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Recording {
-    /// The file, for messages.
+    /// File name, for messages.
     pub name: String,
     /// The rig as calibrated.
     pub rig: Rig,
-    /// How wrong the rig may be; `None` where nothing is stated.
+    /// Prior of the rig's error; `None` if not stated.
     pub rig_prior: Option<RigPrior>,
     /// Nominal marks in the gripper's frame, metres.
     pub marks: Vec<Vec3>,
-    /// What is known of the noise.
+    /// Noise model.
     pub noise: Noise,
     /// The rests.
     pub poses: Vec<ArmPose>,
-    /// Where the gripper is assumed to sit on the flange, where somebody stated it.
+    /// Assumed `flange_from_gripper`, if stated.
     pub assumed: Option<Pose>,
 }
 

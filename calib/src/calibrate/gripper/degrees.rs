@@ -1,32 +1,33 @@
-//! Rotation vectors in degrees that somebody took for radians, undone.
+//! Recovers rotations from rotation vectors in degrees that were interpreted as radians.
 //!
-//! A rotation made of v degrees as if they were radians keeps the axis and loses whole turns of the angle: an angle θ
-//! about n was φ = θ + 2πk or, about -n, φ = 2πk - θ "radians", which are φ degrees up to 180. That is some 57
-//! candidates a pose. Angles between poses do not depend on the unknown frames, and the images give them, so that two
-//! poses' candidates fix all others'.
+//! Such a rotation keeps the axis, but the angle is only known modulo 2π: an angle θ about n came from φ = θ + 2πk or,
+//! about -n, from φ = 2πk - θ; φ is the angle in degrees and at most 180. This leaves about 57 candidates per pose. The
+//! angles between poses do not depend on the unknown frames, and the images measure them. The candidates of two poses
+//! therefore determine those of all others.
 
 use super::closed_form::Rest;
 use graspd_rt::geom::Pose;
 use nalgebra::UnitQuaternion;
 use std::f64::consts::TAU;
 
-/// Angles between poses agree within this, rad: two rests' orientations by the cameras.
-const AGREE: f64 = 0.02;
-/// Share of the poses that have to find a candidate: chance gives one in a hundred.
-const SUPPORT: f64 = 0.7;
-/// Poses that are looked at; more decide nothing more.
-const MOST: usize = 60;
+/// Maximum difference of an angle between two poses from the cameras' value, rad: noise of two camera orientations.
+const MAX_MISMATCH_RAD: f64 = 0.02;
+/// Minimum fraction of the poses with a consistent candidate: by chance, one pose in a hundred has one.
+const MIN_SUPPORT_FRACTION: f64 = 0.7;
+/// Maximum number of poses that are used; more do not change the decision.
+const MAX_POSES: usize = 60;
 
-/// Flange poses with their rotations read as degrees; `None` where that does not agree with the images either.
+/// Flange poses with their rotations read as degrees; `None` if these do not agree with the images either.
 pub(super) fn read_as_degrees(rests: &[Rest]) -> Option<Vec<Pose>> {
-    let n = rests.len().min(MOST);
+    let n = rests.len().min(MAX_POSES);
     if n < 4 {
         return None;
     }
     let all: Vec<Vec<UnitQuaternion<f64>>> = rests[..n].iter().map(|r| candidates(&r.flange)).collect();
     let seen = |i: usize, j: usize| rests[i].view.rotation.angle_to(&rests[j].view.rotation);
-    let fits = |a: &UnitQuaternion<f64>, b: &UnitQuaternion<f64>, angle: f64| (a.angle_to(b) - angle).abs() < AGREE;
-    // The second pose is the one that turned most against the first: small turns tell candidates apart badly.
+    let fits =
+        |a: &UnitQuaternion<f64>, b: &UnitQuaternion<f64>, angle: f64| (a.angle_to(b) - angle).abs() < MAX_MISMATCH_RAD;
+    // The second pose has the largest rotation relative to the first: small rotations do not separate the candidates.
     let second = (1..n).max_by(|&a, &b| seen(0, a).total_cmp(&seen(0, b)))?;
     let mut best: Option<(usize, Vec<Option<UnitQuaternion<f64>>>)> = None;
     for a in &all[0] {
@@ -44,7 +45,7 @@ pub(super) fn read_as_degrees(rests: &[Rest]) -> Option<Vec<Pose>> {
             }
         }
     }
-    let (support, found) = best.filter(|b| b.0 as f64 >= SUPPORT * n as f64)?;
+    let (support, found) = best.filter(|b| b.0 as f64 >= MIN_SUPPORT_FRACTION * n as f64)?;
     debug_assert!(support <= n);
     let read = |r: &Rest, q: Option<UnitQuaternion<f64>>| {
         Pose::from_parts(r.flange.translation, q.unwrap_or(r.flange.rotation))

@@ -1,70 +1,73 @@
-//! What keeps a gripper calibration from being made, said so that the reader knows what to change.
+//! Errors and findings of a gripper calibration. Each message states what to change.
 
-/// Why there is no calibration.
+/// Why a gripper calibration failed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum GripperError {
     /// The file cannot be opened, or is too large to be a recording.
-    #[error("{path}: cannot be read: {reason}; name a file that `graspd calibrate record` wrote, or one of its form")]
+    #[error(
+        "{path}: cannot be read: {reason}; give a file written by `graspd calibrate record`, or one of the same format"
+    )]
     Read {
         /// The file.
         path: String,
-        /// What stands in the way.
+        /// Why it cannot be read.
         reason: String,
     },
-    /// The text is no JSON of this form.
-    #[error("{path}:{line}:{column}: {problem}; the form is described in docs/CALIBRATION.md, section Gripper")]
+    /// The text is not a JSON recording.
+    #[error("{path}:{line}:{column}: {problem}; the format is described in docs/CALIBRATION.md, section Gripper")]
     Syntax {
         /// The file.
         path: String,
-        /// Line, counted from 1.
+        /// Line, from 1.
         line: usize,
-        /// Column, counted from 1.
+        /// Column, from 1.
         column: usize,
-        /// What is wrong there.
+        /// The syntax error.
         problem: String,
     },
-    /// A value cannot be what its key says.
+    /// A value is invalid for its key.
     #[error("{path}: `{key}`: {problem}; {fix}")]
     Value {
         /// The file.
         path: String,
-        /// The key, with its place.
+        /// The key, with its path in the file.
         key: String,
-        /// What is wrong with it.
+        /// Why the value is invalid.
         problem: String,
         /// What to do.
         fix: String,
     },
-    /// There is not enough in the recording to start from.
+    /// The recording has too few usable rests.
     #[error("{problem}; {fix}")]
     TooLittle {
-        /// What is missing, in figures.
+        /// What is missing, with numbers.
         problem: String,
         /// What to record.
         fix: String,
     },
-    /// What was recorded contradicts what was assumed about it.
-    #[error("{}", .0.iter().map(|f| f.words.as_str()).collect::<Vec<_>>().join("\n"))]
+    /// The recording contradicts an assumption about it.
+    #[error("{}", .0.iter().map(|f| f.message.as_str()).collect::<Vec<_>>().join("\n"))]
     Contradiction(Vec<Finding>),
-    /// The fit did not come to rest at a minimum.
-    #[error("the fit did not converge: {0}; check that images and arm poses belong to each other")]
+    /// The fit did not converge.
+    #[error("the fit did not converge: {0}; check that images and arm poses belong to the same recording")]
     NotConverged(String),
 }
 
-/// Something about the recording that a person has to know, with its evidence.
+/// A problem of the recording, with its evidence.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Finding {
-    /// A stable word for programs: `marks-order`, `marks-mirrored`, `marks-unit`, and so on.
+    /// Stable machine-readable code: `marks-order`, `marks-mirrored`, `marks-unit`, and others; the list is in
+    /// docs/CALIBRATION.md.
     pub code: &'static str,
-    /// What was found, the evidence in figures, what to do.
-    pub words: String,
-    /// How strong: the misfit as given over the misfit of the explanation; 0 where nothing was compared.
+    /// What was found, the evidence in numbers, and the fix.
+    pub message: String,
+    /// Strength: misfit as given divided by misfit of the explanation; 0 if there was no comparison.
     pub strength: f64,
 }
 
 impl Finding {
-    /// A finding.
-    pub fn new(code: &'static str, strength: f64, words: impl Into<String>) -> Self {
-        Self { code, words: words.into(), strength }
+    /// Creates a finding.
+    pub fn new(code: &'static str, strength: f64, message: impl Into<String>) -> Self {
+        Self { code, message: message.into(), strength }
     }
 }

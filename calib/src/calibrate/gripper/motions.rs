@@ -1,5 +1,5 @@
-//! Which motion is missing: each one that could be made is tried on the information matrix, and the one that helps most
-//! is named.
+//! Selects the missing motions: the information of each candidate motion is added to the information matrix, and the
+//! motion with the largest error reduction is advised.
 
 use super::bundle::{Model, State};
 use super::predict::in_flange;
@@ -8,35 +8,36 @@ use super::solve::inverse_of;
 use graspd_rt::geom::{Pose, Vec3, View};
 use nalgebra::{DMatrix, Matrix2x6, Translation3, UnitQuaternion};
 
-/// Turn that is tried about each tool axis, degrees: what most wrists can do without losing the marks.
+/// Candidate rotation about each tool axis, degrees: most wrists reach it with the marks still visible.
 const TURN_DEG: f64 = 30.0;
-/// Travel that is tried along each tool axis, metres.
-const TRAVEL: f64 = 0.15;
-/// Most motions in a row that are advised.
-const MOST: usize = 4;
-/// A further motion has to take this share of the error away to be worth a sentence.
-const WORTH: f64 = 0.1;
-/// Pixels that a mark has to stay inside an image to count as seen.
-const MARGIN: f64 = 10.0;
+/// Candidate translation along each tool axis, metres.
+const TRAVEL_M: f64 = 0.15;
+/// Maximum number of advised motions.
+const MAX_MOTIONS: usize = 4;
+/// Minimum fraction by which an advised motion has to reduce the error.
+const MIN_REDUCTION: f64 = 0.1;
+/// Minimum distance of a visible mark from the image border, pixels.
+const IMAGE_MARGIN_PX: f64 = 10.0;
 
-/// A motion worth making.
+/// An advised motion.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Advice {
-    /// What to do, in words.
-    pub words: String,
+    /// Instruction for the operator.
+    pub instruction: String,
     /// Standard deviation of the marks in the flange's frame before, metres.
     pub before_m: f64,
-    /// The same once this motion was recorded as well.
+    /// The same after this motion is recorded.
     pub after_m: f64,
 }
 
-/// A motion that could be made: words, and where the flange then stands relative to where it stood.
+/// A candidate motion: instruction, and the moved flange relative to the current one, in both directions.
 struct Motion {
-    words: String,
+    instruction: String,
     flange_from_moved: [Pose; 2],
 }
 
-/// Motions in the tool's own axes. A turn goes both ways about the marks, so that they stay where the cameras look.
+/// Motions along and about the tool's axes. The pivot of a rotation is the centre of the marks, so that they stay in
+/// the field of view.
 fn candidates(s: &State) -> Vec<Motion> {
     let marks: Vec3 = s.marks.iter().sum::<Vec3>() / s.marks.len().max(1) as f64;
     let pivot = (s.x * nalgebra::Point3::from(marks)).coords;
@@ -46,23 +47,23 @@ fn candidates(s: &State) -> Vec<Motion> {
             let r = UnitQuaternion::from_axis_angle(&axis, deg.to_radians());
             Pose::from_parts(Translation3::from(pivot - r * pivot), r)
         };
-        let words = if name == "z" {
+        let instruction = if name == "z" {
             format!("turn about the tool's axis (flange z) by {TURN_DEG:.0} deg, both ways")
         } else {
             format!("tilt about the tool's {name} axis by {TURN_DEG:.0} deg, both ways")
         };
-        out.push(Motion { words, flange_from_moved: [turn(TURN_DEG), turn(-TURN_DEG)] });
+        out.push(Motion { instruction, flange_from_moved: [turn(TURN_DEG), turn(-TURN_DEG)] });
     }
     for (axis, name) in [(Vec3::x(), "x"), (Vec3::y(), "y"), (Vec3::z(), "z")] {
         let go = |d: f64| Pose::from_parts(Translation3::from(axis * d), UnitQuaternion::identity());
-        let words = format!("move along the tool's {name} axis by {:.0} mm, both ways", TRAVEL * 1e3);
-        out.push(Motion { words, flange_from_moved: [go(TRAVEL), go(-TRAVEL)] });
+        let instruction = format!("move along the tool's {name} axis by {:.0} mm, both ways", TRAVEL_M * 1e3);
+        out.push(Motion { instruction, flange_from_moved: [go(TRAVEL_M), go(-TRAVEL_M)] });
     }
     out
 }
 
-/// The motions that bring the marks' error in the flange's frame below `tolerance_m`, best first; empty where it is
-/// below already.
+/// Motions that reduce the error of the marks in the flange frame to at most `tolerance_m`, best first; empty if it
+/// already is.
 pub(super) fn advise(
     model: &Model<'_>,
     s: &State,
@@ -75,7 +76,7 @@ pub(super) fn advise(
     let mut now = in_flange(model, s, covariance);
     let Some(centre) = middle(model) else { return out };
     let mut left = candidates(s);
-    while now > tolerance_m && out.len() < MOST {
+    while now > tolerance_m && out.len() < MAX_MOTIONS {
         let mut best: Option<(usize, f64, DMatrix<f64>)> = None;
         for (k, motion) in left.iter().enumerate() {
             let more = motion.flange_from_moved.iter().map(|m| of_pose(model, s, &(centre * m), noise));
@@ -86,17 +87,17 @@ pub(super) fn advise(
             }
         }
         let Some((k, after, with)) = best else { break };
-        if after > (1.0 - WORTH) * now {
+        if after > (1.0 - MIN_REDUCTION) * now {
             break;
         }
-        out.push(Advice { words: left.remove(k).words, before_m: now, after_m: after });
+        out.push(Advice { instruction: left.remove(k).instruction, before_m: now, after_m: after });
         information = with;
         now = after;
     }
     out
 }
 
-/// The recorded flange pose nearest to the mean position: a place that the arm can reach.
+/// The recorded flange pose nearest to the mean position: a pose that the arm can reach.
 fn middle(model: &Model<'_>) -> Option<Pose> {
     let poses = &model.rec.poses;
     let mean: Vec3 =
@@ -105,7 +106,7 @@ fn middle(model: &Model<'_>) -> Option<Pose> {
     poses.iter().map(|p| p.base_from_flange).min_by(|a, b| off(a).total_cmp(&off(b)))
 }
 
-/// Information about the global unknowns that a rest at this flange pose would bring, its own correction eliminated.
+/// Information about the global unknowns from a rest at this flange pose, with its flange correction eliminated.
 fn of_pose(model: &Model<'_>, s: &State, flange: &Pose, noise: [f64; 3]) -> DMatrix<f64> {
     let [px, flange_m, flange_rad] = noise;
     let g = model.globals();
@@ -120,7 +121,7 @@ fn of_pose(model: &Model<'_>, s: &State, flange: &Pose, noise: [f64; 3]) -> DMat
         let in_left = (left_from_flange * nalgebra::Point3::from(in_flange)).coords;
         for view in View::BOTH {
             let Some(p) = project(&rig, view, &in_left) else { continue };
-            if !rig.camera(view).contains(p.px, MARGIN) {
+            if !rig.camera(view).contains(p.px, IMAGE_MARGIN_PX) {
                 continue;
             }
             let by_flange = p.by_point * turn;

@@ -1,11 +1,11 @@
-//! What a calibration is for: where it says the marks will be, and how well.
+//! Predicted accuracy of the marks in the left camera, in the images and in the flange frame.
 
 use super::bundle::{Model, POSES, State};
 use super::rig_prior::{project, skew};
 use graspd_rt::geom::{Pose, Vec3, View};
 use nalgebra::{DMatrix, Matrix3, SMatrix};
 
-/// Predicted standard deviations of marks at poses without a measurement of their own.
+/// Predicted standard deviations of the marks at poses without a measurement.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Prediction {
     /// Root mean square position error in the left camera's frame (length of the vector), metres.
@@ -16,7 +16,7 @@ pub struct Prediction {
     pub flange_m: f64,
 }
 
-/// Predicts over flange poses, all marks and both views.
+/// Root mean square over flange poses, all marks and both views.
 pub(super) fn predict(model: &Model<'_>, s: &State, covariance: &DMatrix<f64>, flanges: &[Pose]) -> Prediction {
     let g = covariance.nrows();
     let rig = model.rig(s);
@@ -51,7 +51,7 @@ pub(super) fn predict(model: &Model<'_>, s: &State, covariance: &DMatrix<f64>, f
     Prediction { left_m: root(m2, m_n), px: root(p2, p_n), flange_m: in_flange(model, s, covariance) }
 }
 
-/// Root mean square standard deviation of the marks in the flange's frame, metres.
+/// Root mean square of the marks' standard deviations in the flange's frame, metres.
 pub(super) fn in_flange(model: &Model<'_>, s: &State, covariance: &DMatrix<f64>) -> f64 {
     let turn = *s.x.rotation.to_rotation_matrix().matrix();
     let mut sum = 0.0;
@@ -66,7 +66,7 @@ pub(super) fn in_flange(model: &Model<'_>, s: &State, covariance: &DMatrix<f64>)
     (sum / s.marks.len().max(1) as f64).sqrt()
 }
 
-/// How a point moves by a screw of its frame, seen from a frame turned by `turn`.
+/// Derivative of a point by a twist of its frame, in a frame rotated by `turn`.
 fn screw(turn: &Matrix3<f64>, point: &Vec3) -> SMatrix<f64, 3, 6> {
     let mut j = SMatrix::<f64, 3, 6>::zeros();
     j.fixed_view_mut::<3, 3>(0, 0).copy_from(turn);

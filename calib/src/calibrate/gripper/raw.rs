@@ -1,8 +1,8 @@
-//! The serde mirror of a recording; keys as in the file, lengths in its unit.
+//! Serde representation of a recording: keys as in the file, lengths in the file's unit.
 
 use serde::{Deserialize, Serialize};
 
-/// Four rows of a homogeneous transformation.
+/// Rows of a 4x4 homogeneous transformation.
 pub(super) type Matrix4 = [[f64; 4]; 4];
 
 #[derive(Clone, Debug, Serialize, Deserialize)]

@@ -1,4 +1,4 @@
-//! Reads a recording: JSON of the form that docs/CALIBRATION.md describes.
+//! Reads a recording in the JSON format of docs/CALIBRATION.md.
 
 use super::data::{ArmPose, Noise, Recording, Sighting, Sigma};
 use super::error::GripperError;
@@ -9,22 +9,22 @@ use graspd_rt::geom::{Camera, Distortion, Pixel, Pose, Rig, Vec3};
 use nalgebra::{DMatrix, Matrix3, Rotation3, Translation3, UnitQuaternion};
 use std::path::Path;
 
-/// Largest file that is read, bytes: two thousand poses of 32 marks take a fifth of it.
-const MOST_BYTES: u64 = 64 << 20;
-/// Most poses of a recording.
-const MOST_POSES: usize = 2000;
-/// Most marks of a gripper: what the loop can carry.
-const MOST_MARKS: usize = graspd_rt::gripper::MAX_MARKS;
-/// How far a rotation matrix in a file may be from one: four digits.
-const NOT_A_ROTATION: f64 = 1e-3;
-/// A stated deviation of zero still leaves rounding: a micrometre, a thousandth of a pixel, a ten-thousandth of a
-/// degree.
-const LEAST: [f64; 3] = [1e-6, 1.745e-6, 1e-3];
+/// Maximum size of a recording, bytes: 2000 poses of 32 marks take a fifth of it.
+const MAX_FILE_BYTES: u64 = 64 << 20;
+/// Maximum number of poses of a recording.
+const MAX_POSES: usize = 2000;
+/// Maximum number of marks of a gripper: the capacity of the servo loop.
+const MAX_MARKS: usize = graspd_rt::gripper::MAX_MARKS;
+/// Maximum deviation of a file's rotation matrix from orthonormality, per element of RᵀR: four digits.
+const MAX_AXES_ERROR: f64 = 1e-3;
+/// Minimum standard deviation that a stated zero is replaced by, for rounding: position 1 um (m), orientation 0.0001
+/// degrees (rad), mark 0.001 px (px).
+const MIN_SIGMA: [f64; 3] = [1e-6, 1.745e-6, 1e-3];
 
-/// Reads and checks a recording; `rig` stands in for the recording's own where it is given.
+/// Reads and validates a recording. `rig`, if given, replaces the recording's own.
 ///
 /// # Errors
-/// A file that cannot be read, text that is no JSON of this form, or a value that cannot be what its key says.
+/// A file that cannot be read, text that is not a JSON recording, or a value that is invalid for its key.
 pub fn load(path: &Path, rig: Option<&RigFile>) -> Result<Recording, GripperError> {
     let name = path.display().to_string();
     let refuse = |reason: String| GripperError::Read { path: name.clone(), reason };
@@ -32,17 +32,17 @@ pub fn load(path: &Path, rig: Option<&RigFile>) -> Result<Recording, GripperErro
     if !meta.is_file() {
         return Err(refuse("it is not a regular file".into()));
     }
-    if meta.len() > MOST_BYTES {
-        return Err(refuse(format!("it has {} bytes, more than {MOST_BYTES}", meta.len())));
+    if meta.len() > MAX_FILE_BYTES {
+        return Err(refuse(format!("it has {} bytes, the maximum is {MAX_FILE_BYTES}", meta.len())));
     }
     let text = std::fs::read_to_string(path).map_err(|e| refuse(e.to_string()))?;
     parse(&text, &name, rig)
 }
 
-/// The gripper file inside a recording of `graspd calibrate record`.
+/// Returns the gripper file embedded in a recording of `graspd calibrate record`.
 ///
 /// # Errors
-/// A recording without one, or with one that is not valid.
+/// The recording has no gripper file, or an invalid one.
 pub fn gripper_of(path: &Path) -> Result<GripperFile, GripperError> {
     let name = path.display().to_string();
     let refuse = |problem: String| {
@@ -50,17 +50,17 @@ pub fn gripper_of(path: &Path) -> Result<GripperFile, GripperError> {
         path: name.clone(),
         key: "gripper_toml".into(),
         problem,
-        fix: "name a gripper file with --gripper: its openings, fingers and mark normals are kept, marks and mounting replaced".into(),
+        fix: "give a gripper file with --gripper: its openings, fingers and mark normals are kept, its mark positions and mounting replaced".into(),
     }
     };
     let text =
         std::fs::read_to_string(path).map_err(|e| GripperError::Read { path: name.clone(), reason: e.to_string() })?;
     let raw: RawRecording = serde_json::from_str(&text).map_err(|e| refuse(e.to_string()))?;
-    let text = raw.gripper_toml.ok_or_else(|| refuse("the recording does not describe the gripper's shape".into()))?;
+    let text = raw.gripper_toml.ok_or_else(|| refuse("the recording contains no gripper file".into()))?;
     GripperFile::parse(&text, "gripper_toml").map_err(|e| refuse(e.to_string()))
 }
 
-/// Checks a recording given as text; `name` stands for the file in errors.
+/// Parses and validates a recording given as text; `name` is the file name in errors.
 ///
 /// # Errors
 /// As [`load`].
@@ -76,7 +76,7 @@ pub fn parse(text: &str, name: &str, rig: Option<&RigFile>) -> Result<Recording,
 
 struct Reader<'a> {
     name: &'a str,
-    /// Metres in a unit of length of the file.
+    /// Length unit of the file, metres.
     unit: f64,
 }
 
@@ -87,8 +87,7 @@ impl Reader<'_> {
 
     fn recording(mut self, raw: RawRecording, given: Option<&RigFile>) -> Result<Recording, GripperError> {
         if let Some(kind) = raw.kind.as_deref().filter(|k| *k != "eye-to-hand") {
-            let fix =
-                "cameras that the arm carries are another problem; record with fixed cameras (kind \"eye-to-hand\")";
+            let fix = "cameras mounted on the arm are not supported; record with fixed cameras (kind \"eye-to-hand\")";
             return Err(self.refuse("kind", format!("it is {kind:?}"), fix));
         }
         self.unit = match raw.units.as_ref().map(|u| u.length.as_str()) {
@@ -97,25 +96,25 @@ impl Reader<'_> {
             Some(other) => {
                 return Err(self.refuse(
                     "units.length",
-                    format!("{other:?} is no unit of length here"),
+                    format!("{other:?} is not a supported unit of length"),
                     "write mm or m",
                 ));
             }
         };
-        if !(4..=MOST_MARKS).contains(&raw.marks_mm.len()) {
+        if !(4..=MAX_MARKS).contains(&raw.marks_mm.len()) {
             let problem = format!("{} marks", raw.marks_mm.len());
-            return Err(self.refuse("marks_mm", problem, format!("a gripper carries 4 to {MOST_MARKS}")));
+            return Err(self.refuse("marks_mm", problem, format!("a gripper has 4 to {MAX_MARKS}")));
         }
         let marks = raw.marks_mm.iter().enumerate();
         let marks = marks.map(|(k, m)| self.point(&format!("marks_mm[{k}]"), *m)).collect::<Result<Vec<_>, _>>()?;
-        if raw.poses.is_empty() || raw.poses.len() > MOST_POSES {
+        if raw.poses.is_empty() || raw.poses.len() > MAX_POSES {
             let problem = format!("{} poses", raw.poses.len());
-            return Err(self.refuse("poses", problem, format!("record 1 to {MOST_POSES}")));
+            return Err(self.refuse("poses", problem, format!("record 1 to {MAX_POSES}")));
         }
         let (rig, rig_prior) = match (given, &raw.rig) {
             (Some(file), _) => (file.rig, file.quality.as_ref().map(|_| prior_of_file(file))),
             (None, Some(r)) => self.rig(r, raw.noise.as_ref())?,
-            (None, None) => return Err(self.refuse("rig", "it is missing", "name one with --rig rig.toml")),
+            (None, None) => return Err(self.refuse("rig", "it is missing", "give one with --rig rig.toml")),
         };
         let poses = raw.poses.iter().enumerate();
         let poses = poses.map(|(i, p)| self.pose(i, p, marks.len())).collect::<Result<Vec<_>, _>>()?;
@@ -130,7 +129,7 @@ impl Reader<'_> {
         if v.iter().all(|x| x.abs() < 1e3) {
             return Ok(v);
         }
-        Err(self.refuse(key, format!("{p:?} is not a place within a kilometre"), "give three finite numbers"))
+        Err(self.refuse(key, format!("{p:?} is not a position within 1 km"), "give three finite numbers"))
     }
 
     fn transform(&self, key: &str, m: &Matrix4) -> Result<Pose, GripperError> {
@@ -141,19 +140,19 @@ impl Reader<'_> {
             return Err(self.refuse(
                 key,
                 format!("its last row is {last:?}{why}"),
-                "write 4 rows, the last 0, 0, 0, 1",
+                "write 4 rows, the last one 0, 0, 0, 1",
             ));
         }
         let r = Matrix3::from_fn(|i, j| m[i][j]);
         let off = (r.transpose() * r - Matrix3::identity()).amax();
-        if !(off < NOT_A_ROTATION) {
-            let fix = "write orthonormal axes in columns; a rotation vector or Euler angles have to be converted first";
+        if !(off < MAX_AXES_ERROR) {
+            let fix = "write orthonormal axes in columns; convert a rotation vector or Euler angles to a matrix first";
             return Err(self.refuse(key, format!("its axes are not orthonormal (by {off:.2e})"), fix));
         }
         if r.determinant() < 0.0 {
             return Err(self.refuse(
                 key,
-                "its axes are left-handed: a mirror, not a rotation",
+                "its axes are left-handed: a reflection, not a rotation",
                 "check the signs of the axes",
             ));
         }
@@ -167,7 +166,7 @@ impl Reader<'_> {
         if right_from_left.translation.vector.norm() < 1e-4 {
             return Err(self.refuse(
                 "rig.right_T_left",
-                "both cameras stand in one place",
+                "both cameras have the same position",
                 "give the stereo translation",
             ));
         }
@@ -178,7 +177,7 @@ impl Reader<'_> {
             let problem = format!("not a covariance of {RIG_PARAMETERS} parameters");
             let fix = "symmetric, positive semidefinite, in the order of docs/CALIBRATION.md, in the file's unit of length and rad";
             let square = rows.len() == RIG_PARAMETERS && rows.iter().all(|row| row.len() == RIG_PARAMETERS);
-            // Only the three translations carry the file's unit.
+            // Only the three translation parameters are lengths in the file's unit.
             let unit = |i: usize| if i >= 21 { self.unit } else { 1.0 };
             let c = DMatrix::from_fn(if square { RIG_PARAMETERS } else { 0 }, RIG_PARAMETERS, |i, j| {
                 rows[i][j] * unit(i) * unit(j)
@@ -191,7 +190,7 @@ impl Reader<'_> {
             if !(0.0..=100.0).contains(&v) {
                 return Err(self.refuse(
                     format!("noise.rig.{key}"),
-                    format!("{v} is no standard deviation"),
+                    format!("{v} is not a valid standard deviation"),
                     "give 0 to 100",
                 ));
             }
@@ -210,7 +209,7 @@ impl Reader<'_> {
 
     fn camera(&self, key: &str, c: &RawCamera, size: Option<[u32; 2]>) -> Result<Camera, GripperError> {
         if let Some(m) = c.model.as_deref().filter(|m| *m != "opencv" && *m != "brown") {
-            return Err(self.refuse(format!("{key}.model"), format!("{m:?} is not known here"), "give OpenCV's model"));
+            return Err(self.refuse(format!("{key}.model"), format!("{m:?} is not supported"), "use the OpenCV model"));
         }
         if !matches!(c.d.len(), 0 | 4 | 5 | 8) {
             let problem = format!("{} coefficients", c.d.len());
@@ -219,19 +218,23 @@ impl Reader<'_> {
         let d = |i: usize| c.d.get(i).copied().unwrap_or(0.0);
         let distortion = Distortion { k1: d(0), k2: d(1), p1: d(2), p2: d(3), k3: d(4), k4: d(5), k5: d(6), k6: d(7) };
         let [cx, cy] = [c.k[0][2], c.k[1][2]];
-        // Without a stated size: a principal point in the middle.
+        // Without a stated size, the principal point is taken as the image centre.
         let [width, height] =
             size.unwrap_or([(2.0 * cx).clamp(1.0, 65_535.0) as u32, (2.0 * cy).clamp(1.0, 65_535.0) as u32]);
         if c.k[0][1].abs() > 1e-9 || c.k[2] != [0.0, 0.0, 1.0] || c.k[1][0] != 0.0 {
             return Err(self.refuse(
                 format!("{key}.K"),
-                "it has skew, or is transposed",
+                "it has skew or is transposed",
                 "give fx 0 cx, 0 fy cy, 0 0 1",
             ));
         }
         let camera = Camera { width, height, fx: c.k[0][0], fy: c.k[1][1], cx, cy, distortion };
         camera.validated().map_err(|e| {
-            self.refuse(key, format!("not a camera ({e:?})"), "check K (pixels), D (OpenCV's order) and image_size")
+            self.refuse(
+                key,
+                format!("not a valid camera ({e:?})"),
+                "check K (pixels), D (OpenCV's order) and image_size",
+            )
         })
     }
 
@@ -245,16 +248,24 @@ impl Reader<'_> {
             let key = format!("poses[{i}].marks[{k}]");
             if s.mark >= marks {
                 let problem = format!("mark {} of {marks}", s.mark);
-                return Err(self.refuse(key, problem, "count marks from 0, as in marks_mm"));
+                return Err(self.refuse(key, problem, "number the marks from 0, as in marks_mm"));
             }
             if std::mem::replace(&mut taken[s.mark], true) {
-                return Err(self.refuse(key, format!("mark {} a second time", s.mark), "name each mark once a pose"));
+                return Err(self.refuse(
+                    key,
+                    format!("mark {} appears a second time", s.mark),
+                    "list each mark once per pose",
+                ));
             }
             let mut px = [None; 2];
             for (to, from) in px.iter_mut().zip([s.left, s.right]) {
                 if let Some(v) = from {
                     if !v.iter().all(|x| x.abs() < 1e6) {
-                        return Err(self.refuse(key, format!("{v:?} is no pixel"), "write null where it is hidden"));
+                        return Err(self.refuse(
+                            key,
+                            format!("{v:?} is not a pixel"),
+                            "write null if the mark is hidden",
+                        ));
                     }
                     *to = Some(Pixel::new(v[0], v[1]));
                 }
@@ -269,26 +280,29 @@ impl Reader<'_> {
         let take = |key: &str, v: Option<f64>, unit: f64, least: f64, default: Sigma| match v {
             None => Ok(default),
             Some(v) if (0.0..1e6).contains(&v) => Ok(Sigma { value: (v * unit).max(least), stated: true }),
-            Some(v) => {
-                Err(self.refuse(format!("noise.{key}"), format!("{v} is no standard deviation"), "give 0 or more"))
-            }
+            Some(v) => Err(self.refuse(
+                format!("noise.{key}"),
+                format!("{v} is not a valid standard deviation"),
+                "give 0 or more",
+            )),
         };
         let outliers = n.outlier_fraction.unwrap_or(d.outliers);
         if !(0.0..=0.5).contains(&outliers) {
-            let problem = format!("{outliers} is no share of gross errors");
+            let problem = format!("{outliers} is not a valid fraction");
             return Err(self.refuse("noise.outlier_fraction", problem, "give 0 to 0.5"));
         }
         Ok(Noise {
-            flange_m: take("flange_mm", n.flange_mm, self.unit, LEAST[0], d.flange_m)?,
-            flange_rad: take("flange_deg", n.flange_deg, 1_f64.to_radians(), LEAST[1], d.flange_rad)?,
-            mark_px: take("mark_px", n.mark_px, 1.0, LEAST[2], d.mark_px)?,
+            flange_m: take("flange_mm", n.flange_mm, self.unit, MIN_SIGMA[0], d.flange_m)?,
+            flange_rad: take("flange_deg", n.flange_deg, 1_f64.to_radians(), MIN_SIGMA[1], d.flange_rad)?,
+            mark_px: take("mark_px", n.mark_px, 1.0, MIN_SIGMA[2], d.mark_px)?,
             marks_m: take("mark_model_mm", n.mark_model_mm, self.unit, 0.0, d.marks_m)?,
             outliers,
         })
     }
 }
 
-/// What a rig file states about itself, as a prior: its focal lengths are stated together and by half their difference.
+/// The error that a rig file states, as a prior. It states the common error of the focal lengths and half their
+/// difference.
 fn prior_of_file(file: &RigFile) -> RigPrior {
     let (e, rig) = (file.error(), &file.rig);
     let d = RigDeviations {
@@ -308,7 +322,7 @@ fn prior_of_file(file: &RigFile) -> RigPrior {
             factor[(9 + row, column)] = right * r;
         }
     }
-    // A target's printed size is known to about the focal lengths' relative error at best.
+    // The printed size of a target is known to about the relative error of the focal lengths at best.
     let t = rig.right_from_left.translation.vector * e.focal;
     (0..3).for_each(|i| factor[(21 + i, 2)] = t[i]);
     RigPrior { factor }

@@ -1,4 +1,4 @@
-//! The answer in words and as one JSON object (millimetres, degrees and pixels, as the recording has them).
+//! Formats the result as text and as one JSON object, in the units of the recording (millimetres, degrees, pixels).
 
 use super::data::Recording;
 use super::error::{Finding, GripperError};
@@ -7,21 +7,21 @@ use super::solution::Solution;
 use graspd_rt::geom::{Camera, Pose, View};
 use serde_json::{Value, json};
 
-/// Whether the answer may be used.
+/// Whether the result may be used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// It may.
+    /// The result may be used.
     Good,
-    /// A motion is missing: the marks against the flange are not known well enough.
+    /// A motion is missing: the marks in the flange frame are not accurate enough.
     MotionMissing,
-    /// Something contradicts it: the findings say what.
+    /// The result is contradicted; the findings state by what.
     Doubtful,
 }
 
 impl Solution {
-    /// Whether the answer may be used for this tolerance (standard deviation of the marks against the flange, metres).
+    /// Verdict for this tolerance (standard deviation of the marks in the flange frame, metres).
     pub fn verdict(&self, tolerance_m: f64) -> Verdict {
-        if self.findings.iter().any(|f| f.code == "tcp" && self.foreign.is_empty()) {
+        if self.findings.iter().any(|f| f.code == "tcp" && self.outlier_poses.is_empty()) {
             Verdict::Doubtful
         } else if self.predicted.flange_m > tolerance_m {
             Verdict::MotionMissing
@@ -30,7 +30,7 @@ impl Solution {
         }
     }
 
-    /// The one object of `--json`.
+    /// The JSON object of `--json`.
     pub fn to_json(&self, rec: &Recording, tolerance_m: f64) -> Value {
         let h = &self.hypothesis;
         let mut out = json!({
@@ -47,7 +47,7 @@ impl Solution {
                 "image_px": self.predicted.px,
                 "marks_in_flange_mm": self.predicted.flange_m * 1e3,
             },
-            "rig_used": self.rig_words(),
+            "rig_used": self.rig_text(),
             "rig_scale": h.rig_scale,
             "marks_free": h.free_marks,
             "hypotheses": self.tried.iter().map(|t| json!({
@@ -63,11 +63,11 @@ impl Solution {
             "outliers": self.gross.iter().map(|g| json!({
                 "pose": g.pose, "mark": g.mark, "view": if g.view == View::Left { "left" } else { "right" }, "px": g.px,
             })).collect::<Vec<_>>(),
-            "foreign_poses": self.foreign.iter().map(|f| json!({
+            "foreign_poses": self.outlier_poses.iter().map(|f| json!({
                 "pose": f.pose, "reported_T_fitted": matrix(&f.reported_from_fitted),
             })).collect::<Vec<_>>(),
             "motions": self.advice.iter().map(|a| json!({
-                "do": a.words, "before_mm": a.before_m * 1e3, "after_mm": a.after_m * 1e3,
+                "do": a.instruction, "before_mm": a.before_m * 1e3, "after_mm": a.after_m * 1e3,
             })).collect::<Vec<_>>(),
             "findings": findings(&self.findings),
             "covariance": self.covariance_json(),
@@ -82,7 +82,7 @@ impl Solution {
         out
     }
 
-    /// Joint covariance with names, and the deviations of both poses: mm, rad, px.
+    /// Joint covariance with parameter names, and the standard deviations of both poses: mm, rad, px.
     fn covariance_json(&self) -> Value {
         let mut names: Vec<String> = Vec::new();
         for pose in ["flange_T_gripper", "base_T_left"] {
@@ -109,7 +109,7 @@ impl Solution {
             })
         };
         json!({
-            "convention": "truth = estimate * exp(v, w), v mm and w rad in the frame on the right; marks in the gripper's frame; rig as \
+            "convention": "truth = estimate * exp(v, w), v mm and w rad in the right-hand frame; marks in the gripper's frame; rig as \
                            in docs/CALIBRATION.md, translation in mm",
             "parameters": names,
             "matrix": (0..n).map(|i| (0..n).map(|j| c(i, j)).collect::<Vec<_>>()).collect::<Vec<_>>(),
@@ -119,32 +119,32 @@ impl Solution {
         })
     }
 
-    /// Which rig the fit used.
-    fn rig_words(&self) -> String {
+    /// Description of the rig that the fit used.
+    fn rig_text(&self) -> String {
         let h = &self.hypothesis;
         let scale = h.rig_scale;
         match (h.rig_stated, scale) {
-            (true, _) => "the rig with its stated covariance as prior; refined".into(),
-            (false, 0.0) => "the rig as given: no error of it is likelier than a small one".into(),
+            (true, _) => "refined, with its stated covariance as prior".into(),
+            (false, 0.0) => "as given: the images show no error of the rig".into(),
             (false, _) => format!(
-                "the rig refined: the images speak for errors of {scale} times 1 px (focal lengths, principal points) and 0.01 deg; \
-                 nothing was stated"
+                "refined: the images show errors of {scale} times 1 px (focal lengths, principal points) and 0.01 deg; no covariance \
+                 is stated"
             ),
         }
     }
 
-    /// The answer for people.
-    pub fn words(&self, rec: &Recording, tolerance_m: f64) -> String {
+    /// The result as text.
+    pub fn to_text(&self, rec: &Recording, tolerance_m: f64) -> String {
         let p = &self.predicted;
         let mut out = vec![
             match self.verdict(tolerance_m) {
                 Verdict::Good => "Good: the gripper is calibrated.".to_owned(),
                 Verdict::MotionMissing => "Not good enough yet: a motion is missing.".to_owned(),
-                Verdict::Doubtful => "Doubtful: the answer contradicts what is known about the gripper.".to_owned(),
+                Verdict::Doubtful => "Doubtful: the result contradicts the known mounting of the gripper.".to_owned(),
             },
             format!(
-                "A mark in the working volume will be found {:.2} mm (one sigma, left camera) and {:.3} px from where it is predicted; \
-                 against the flange the marks are known to {:.3} mm, of {:.3} mm allowed.",
+                "Predicted error of a mark in the working volume: {:.2} mm (one sigma, left camera) and {:.3} px. Error of the marks in \
+                 the flange frame: {:.3} mm, tolerance {:.3} mm.",
                 p.left_m * 1e3,
                 p.px,
                 p.flange_m * 1e3,
@@ -161,30 +161,30 @@ impl Solution {
                 self.noise[2].to_degrees(),
                 if self.noise[3] > 0.0 { format!(", marks {:.3} mm", self.noise[3] * 1e3) } else { String::new() }
             ),
-            format!("Rig: {}.", self.rig_words()),
+            format!("Rig: {}.", self.rig_text()),
         ];
         out.push(pose_line("flange_from_gripper", &self.flange_from_gripper, &self.covariance, 0));
         out.push(pose_line("base_from_left", &self.base_from_left, &self.covariance, 6));
         for a in &self.advice {
             let (before, after) = (a.before_m * 1e3, a.after_m * 1e3);
-            out.push(format!("Do: {}: {before:.2} mm becomes {after:.2} mm.", a.words));
+            out.push(format!("Add this motion: {}: {before:.2} mm becomes {after:.2} mm.", a.instruction));
         }
-        out.extend(self.findings.iter().map(|f| f.words.clone()));
+        out.extend(self.findings.iter().map(|f| f.message.clone()));
         out.join("\n")
     }
 }
 
-/// The one object of `--json` where there is no calibration.
+/// The JSON object of `--json` for a failed calibration.
 pub fn refusal_json(e: &GripperError) -> Value {
     let list = if let GripperError::Contradiction(list) = e { findings(list) } else { json!([]) };
     json!({ "verdict": "refused", "reason": e.to_string(), "findings": list })
 }
 
 fn findings(list: &[Finding]) -> Value {
-    list.iter().map(|f| json!({ "code": f.code, "words": f.words, "strength": f.strength })).collect()
+    list.iter().map(|f| json!({ "code": f.code, "words": f.message, "strength": f.strength })).collect()
 }
 
-/// Four rows in millimetres.
+/// Rows of the 4x4 matrix, translation in millimetres.
 pub(super) fn matrix(p: &Pose) -> [[f64; 4]; 4] {
     let r = p.rotation.to_rotation_matrix();
     let t = p.translation.vector * 1e3;
@@ -192,7 +192,7 @@ pub(super) fn matrix(p: &Pose) -> [[f64; 4]; 4] {
     [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
 }
 
-/// A camera as a recording has it.
+/// A camera in the format of a recording.
 pub(super) fn camera(c: &Camera) -> Value {
     let d = &c.distortion;
     let five = [d.k1, d.k2, d.p1, d.p2, d.k3];

@@ -1,10 +1,10 @@
-//! The rig's own error: twenty-four parameters, what is known about them, and what they do to a pixel.
+//! Error model of the rig: 24 parameters, their prior covariance, and the derivatives of a pixel by them.
 //!
-//! The order is fx, fy, cx, cy, k1, k2, p1, p2, k3 of the left camera, the same of the right, then a turn of the right
-//! camera about its own axes (rad) that leaves the translation alone, and the translation of `right_from_left`
-//! (metres). What is known is a covariance Σ = L Lᵀ of any rank; the unknowns of the fit are u with δ = L u and u ~
-//! N(0, 1), so that a direction without variance is no unknown at all, and correlations (the two focal lengths of one
-//! camera, a principal point and a turn) are kept.
+//! The order is fx, fy, cx, cy, k1, k2, p1, p2, k3 of the left camera, the same of the right camera, then a rotation of
+//! the right camera about its own axes (rad) that does not change the translation, and the translation of
+//! `right_from_left` (metres). The prior is a covariance Σ = L Lᵀ of any rank. The unknowns of the fit are u with δ = L
+//! u and u ~ N(0, 1). A direction without variance has no unknown, and correlations (the two focal lengths of one
+//! camera, a principal point and a rotation) are kept.
 
 use graspd_rt::geom::{Camera, Pixel, Pose, Rig, Vec3, View, exp_twist};
 use nalgebra::{DMatrix, Matrix2x3, Matrix3, SMatrix, SVector, Vector6};
@@ -12,7 +12,7 @@ use nalgebra::{DMatrix, Matrix2x3, Matrix3, SMatrix, SVector, Vector6};
 /// Number of the rig's parameters.
 pub const RIG_PARAMETERS: usize = 24;
 
-/// Parameters of one camera among them.
+/// Number of parameters of one camera.
 const CAMERA: usize = 9;
 
 /// Names of the parameters, in order; lengths in metres, angles in rad.
@@ -46,10 +46,10 @@ pub const RIG_NAMES: [&str; RIG_PARAMETERS] = [
 /// A change of the rig's parameters.
 pub(super) type RigChange = SVector<f64, RIG_PARAMETERS>;
 
-/// What is known about how wrong a rig is: δ = `factor` · u with u ~ N(0, 1).
+/// Prior of the rig's error: δ = `factor` · u with u ~ N(0, 1).
 #[derive(Clone, Debug, PartialEq)]
 pub struct RigPrior {
-    /// 24 rows, one column a direction that has variance.
+    /// 24 rows, one column per direction with variance.
     pub factor: DMatrix<f64>,
 }
 
@@ -58,7 +58,7 @@ pub struct RigPrior {
 pub struct RigDeviations {
     /// Focal length of each camera, fx and fy together, pixels.
     pub focal_px: f64,
-    /// fy against fx of one camera, pixels.
+    /// Difference of fy and fx of one camera, pixels.
     pub aspect_px: f64,
     /// Each coordinate of each principal point, pixels.
     pub principal_px: f64,
@@ -71,9 +71,9 @@ pub struct RigDeviations {
 }
 
 impl Default for RigDeviations {
-    /// One pixel of each focal length and principal point and a hundredth of a degree: twice what a joint fit of a
-    /// dozen pairs leaves (0.4 px in the public samples). It is the unit of the ladder in `hypotheses.rs`, not a
-    /// belief.
+    /// 1 px for each focal length and principal point and 0.01 degrees: about twice the error of a joint fit of a
+    /// dozen pairs (0.4 px in the public samples). This is the unit of `RIG_SCALES` in `hypotheses.rs`, not an estimate
+    /// for a particular rig.
     fn default() -> Self {
         Self {
             focal_px: 1.0,
@@ -87,12 +87,12 @@ impl Default for RigDeviations {
 }
 
 impl RigPrior {
-    /// A rig without any error.
+    /// A rig without error.
     pub fn exact() -> Self {
         Self { factor: DMatrix::zeros(RIG_PARAMETERS, 0) }
     }
 
-    /// Independent deviations.
+    /// Independent standard deviations.
     pub fn from_deviations(d: &RigDeviations, rig: &Rig) -> Self {
         let mut columns: Vec<RigChange> = Vec::new();
         let mut add = |entries: &[(usize, f64)]| {
@@ -119,19 +119,19 @@ impl RigPrior {
         Self { factor: stacked(&columns) }
     }
 
-    /// From a 24x24 covariance in the order of [`RIG_NAMES`]; `None` when it is none (not finite, not symmetric, not
-    /// semidefinite).
+    /// From a 24x24 covariance in the order of [`RIG_NAMES`]; `None` if it is not a covariance (not finite, not
+    /// symmetric, or not positive semidefinite).
     pub fn from_covariance(c: &DMatrix<f64>) -> Option<Self> {
         if c.nrows() != RIG_PARAMETERS || c.ncols() != RIG_PARAMETERS || c.iter().any(|v| !v.is_finite()) {
             return None;
         }
-        // In units of each parameter's own deviation, so that pixels and radians can be weighed against each other.
+        // Correlation form: scaled by each parameter's standard deviation, so that pixels and radians are comparable.
         let sd: Vec<f64> = (0..RIG_PARAMETERS).map(|i| c[(i, i)].max(0.0).sqrt()).collect();
         let live: Vec<usize> = (0..RIG_PARAMETERS).filter(|&i| sd[i] > 0.0).collect();
         let n = live.len();
         let r = DMatrix::from_fn(n, n, |i, j| c[(live[i], live[j])] / (sd[live[i]] * sd[live[j]]));
         let skew = (&r - r.transpose()).amax();
-        // Nine digits in a file leave 1e-9; a matrix of another kind leaves more.
+        // Nine digits in a file leave an asymmetry of 1e-9; a matrix that is not a covariance leaves more.
         if skew > 1e-6 {
             return None;
         }
@@ -154,10 +154,10 @@ impl RigPrior {
         Some(Self { factor: stacked(&columns) })
     }
 
-    /// From a covariance with names, as `graspd calibrate rig` states it: cameras as in [`RIG_NAMES`], and
+    /// From a covariance with parameter names, as written by `graspd calibrate rig`: cameras as in [`RIG_NAMES`], and
     /// `right_from_left.x` to `.rz` for a small motion of the right camera, x_right = exp(v, w) right_from_left x_left.
-    /// `None` for a name that is not known here (k4 to k6 are left out: a rational lens is held), or a matrix that is
-    /// no covariance.
+    /// k4 to k6 are ignored: the rational lens terms are fixed. `None` for any other unknown name, or a matrix that is
+    /// not a covariance.
     pub fn from_named(names: &[String], c: &DMatrix<f64>, rig: &Rig) -> Option<Self> {
         let n = names.len();
         if c.shape() != (n, n) {
@@ -175,7 +175,8 @@ impl RigPrior {
                 Some(axis @ ("rx" | "ry" | "rz")) => {
                     let k = "xyz".find(&axis[1..])?;
                     to_own[(18 + k, j)] = 1.0;
-                    // The motion turns the translation as well, which the turn of this list does not: t + w x t.
+                    // The motion also rotates the translation, to t + w x t; the rotation parameter of this list does
+                    // not.
                     (0..3).for_each(|i| to_own[(21 + i, j)] = -lever[(i, k)]);
                 }
                 _ if ["k4", "k5", "k6"].iter().any(|k| name.ends_with(k)) => {}
@@ -185,7 +186,7 @@ impl RigPrior {
         Self::from_covariance(&(&to_own * c * to_own.transpose()))
     }
 
-    /// Every deviation multiplied by `by`; zero makes the rig exact.
+    /// Every standard deviation multiplied by `by`; zero makes the rig exact.
     pub fn scaled(&self, by: f64) -> Self {
         if by == 0.0 { Self::exact() } else { Self { factor: &self.factor * by } }
     }
@@ -200,7 +201,7 @@ fn stacked(columns: &[RigChange]) -> DMatrix<f64> {
     DMatrix::from_fn(RIG_PARAMETERS, columns.len(), |i, j| columns[j][i])
 }
 
-/// The rig with its parameters changed.
+/// The rig with `d` added to its parameters.
 pub(super) fn moved(rig: &Rig, d: &RigChange) -> Rig {
     let mut out = *rig;
     for (c, at) in [(&mut out.left, 0), (&mut out.right, CAMERA)] {
@@ -221,7 +222,7 @@ pub(super) fn moved(rig: &Rig, d: &RigChange) -> Rig {
     out
 }
 
-/// A point's pixel in a view with its derivatives.
+/// The pixel of a point in a view, with its derivatives.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Projection {
     /// The pixel.
@@ -234,9 +235,9 @@ pub(super) struct Projection {
 
 /// Projects a point of the left frame; `None` behind the camera.
 pub(super) fn project(rig: &Rig, view: View, x_left: &Vec3) -> Option<Projection> {
-    let place: Pose = rig.view_from_left(view);
-    let turned = place.rotation * x_left;
-    let x = turned + place.translation.vector;
+    let view_from_left: Pose = rig.view_from_left(view);
+    let turned = view_from_left.rotation * x_left;
+    let x = turned + view_from_left.translation.vector;
     let camera = rig.camera(view);
     let (px, by_x) = camera.project_with_jacobian(&x)?;
     let mut by_rig = SMatrix::<f64, 2, RIG_PARAMETERS>::zeros();
@@ -247,7 +248,7 @@ pub(super) fn project(rig: &Rig, view: View, x_left: &Vec3) -> Option<Projection
         by_rig.fixed_view_mut::<2, 3>(0, 18).copy_from(&(-(by_x * s)));
         by_rig.fixed_view_mut::<2, 3>(0, 21).copy_from(&by_x);
     }
-    Some(Projection { px, by_point: by_x * place.rotation.to_rotation_matrix().matrix(), by_rig })
+    Some(Projection { px, by_point: by_x * view_from_left.rotation.to_rotation_matrix().matrix(), by_rig })
 }
 
 /// Derivative of a pixel by its camera's nine parameters.
@@ -273,7 +274,7 @@ fn by_camera(c: &Camera, x: &Vec3, px: Pixel) -> SMatrix<f64, 2, CAMERA> {
     j
 }
 
-/// The matrix of the cross product `a x`.
+/// The skew-symmetric matrix of the cross product `a x`.
 pub(super) fn skew(a: &Vec3) -> Matrix3<f64> {
     Matrix3::new(0.0, -a.z, a.y, a.z, 0.0, -a.x, -a.y, a.x, 0.0)
 }
@@ -295,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn derivatives_agree_with_a_rig_that_is_changed() {
+    fn derivatives_match_finite_differences() {
         let rig = rig();
         for x in [Vec3::new(0.2, 0.1, 1.4), Vec3::new(-0.1, -0.2, 1.7)] {
             for view in View::BOTH {
@@ -314,9 +315,9 @@ mod tests {
         }
     }
 
-    /// A motion of the right camera by a named parameter is the same motion in this list's parameters.
+    /// A motion of the right camera by a named parameter equals the motion by the converted parameters.
     #[test]
-    fn a_named_covariance_is_that_of_the_same_rigs() {
+    fn named_covariance_gives_the_same_motion() {
         let rig = rig();
         for (k, axis) in ["x", "y", "z", "rx", "ry", "rz"].iter().enumerate() {
             let name = format!("right_from_left.{axis}");
@@ -326,7 +327,7 @@ mod tests {
             let own = moved(&rig, &RigChange::from_column_slice(prior.factor.column(0).as_slice()));
             let mut twist = Vector6::zeros();
             twist[k] = h;
-            // The factor's sign is open.
+            // The sign of the factor is arbitrary.
             let off = [twist, -twist].map(|t| {
                 let d = (exp_twist(&t) * rig.right_from_left).inv_mul(&own.right_from_left);
                 d.translation.vector.norm() + d.rotation.angle()
@@ -341,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn a_covariance_comes_back_from_its_factor_and_nonsense_is_refused() {
+    fn covariance_round_trips_through_its_factor_and_invalid_ones_are_rejected() {
         let prior = RigPrior::from_deviations(&RigDeviations::default(), &rig());
         let c = &prior.factor * prior.factor.transpose();
         let again = RigPrior::from_covariance(&c).unwrap();

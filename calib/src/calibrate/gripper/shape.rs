@@ -1,8 +1,8 @@
-//! Are the marks that the cameras see the marks of the file? Their shape answers, before any arm pose is believed.
+//! Checks the shape of the observed marks against the marks of the file. The check uses no arm pose.
 //!
-//! The marks of every rest are triangulated and laid over each other (consensus, then medians), which gives the gripper
-//! as the cameras see it, free of the file. It is held against the file's marks as given, mirrored, in another order,
-//! and both, each with a free scale.
+//! The marks of every rest are triangulated and aligned with each other (consensus, then medians). This gives the shape
+//! of the gripper from the cameras alone. It is compared with the file's marks as given, mirrored, in another order,
+//! and both mirrored and in another order, each with a free scale.
 
 use super::align::{consensus, median, similarity};
 use super::data::Recording;
@@ -10,29 +10,30 @@ use super::error::Finding;
 use super::view_pose::in_space;
 use graspd_rt::geom::Vec3;
 
-/// Shapes agree when their root mean square distance is below this share of their size: triangulated depth is good to 2
-/// mm at 1.5 m in one rest, a tenth of that in the median of many, and an exchange of neighbouring marks moves them by
-/// half the size.
-const SAME: f64 = 0.08;
-/// Or below this many standard deviations of the marks' own places.
-const SAME_SIGMAS: f64 = 4.0;
-/// An explanation has to fit this many times better than what was given.
-const BETTER: f64 = 3.0;
-/// Sides of triangles that correspond agree within this, relative.
-const SIDES: f64 = 0.2;
-/// A scale this close to one is none: a printed or turned gripper is right to a few per mille.
-const SCALE: f64 = 0.03;
-/// Units of length against millimetres, for naming a scale.
+/// Maximum root mean square distance of two equal shapes, as a fraction of their size. Triangulated depth is accurate
+/// to 2 mm at 1.5 m in one rest and to a tenth of that in the median of many; an exchange of neighbouring marks moves
+/// them by half the size.
+const MAX_MISFIT: f64 = 0.08;
+/// The same in standard deviations of the nominal mark positions; the larger of both limits applies.
+const MAX_MISFIT_SIGMAS: f64 = 4.0;
+/// Minimum ratio of the misfit as given to the misfit of an alternative explanation.
+const MIN_IMPROVEMENT: f64 = 3.0;
+/// Maximum relative difference between corresponding sides of two matching triangles.
+const MAX_SIDE_MISMATCH: f64 = 0.2;
+/// Maximum deviation of the scale from one: a printed or machined gripper is accurate to a few per mille.
+const MAX_SCALE_ERROR: f64 = 0.03;
+/// Units of length in millimetres, to name a scale.
 const UNITS: [(f64, &str); 4] = [(1e3, "metres"), (25.4, "inches"), (10.0, "centimetres"), (1e-3, "micrometres")];
 
-/// The gripper as the cameras see it, in the frame of some rest, metres of the rig.
+/// Observed shape of the gripper, in the frame of one of the rests, in the rig's lengths, metres.
 #[derive(Clone, Debug)]
 pub(super) struct Shape {
     pub(super) points: Vec<Option<Vec3>>,
     rests: usize,
 }
 
-/// Sees the shape; `None` without two rests that show three marks each in both views.
+/// Estimates the shape from the rests with at least three marks in both views; `None` if fewer than four marks are
+/// known.
 pub(super) fn seen(rec: &Recording) -> Option<Shape> {
     let clouds: Vec<Vec<(usize, Vec3)>> =
         rec.poses.iter().map(|p| in_space(&rec.rig, p)).filter(|c| c.len() >= 3).collect();
@@ -55,23 +56,23 @@ pub(super) fn seen(rec: &Recording) -> Option<Shape> {
     (known >= 4).then_some(Shape { points, rests: clouds.len() })
 }
 
-/// A way to read the file's marks.
+/// An interpretation of the file's marks.
 #[derive(Clone, Debug)]
 struct Reading {
-    /// For each observed mark, the file's mark that it is.
+    /// For each observed mark, the corresponding mark of the file.
     order: Vec<usize>,
     mirrored: bool,
-    /// Lengths of the cameras over lengths of the file.
+    /// Ratio of the cameras' lengths to the file's lengths.
     scale: f64,
-    /// Root mean square distance over the size.
+    /// Root mean square distance divided by the size.
     misfit: f64,
 }
 
-/// What contradicts the file's marks; and lengths of the cameras over those of the file.
+/// Contradictions of the file's marks, and the ratio of the cameras' lengths to the file's lengths.
 pub(super) fn check(rec: &Recording, shape: &Shape) -> (Vec<Finding>, f64) {
     let given: Vec<usize> = (0..rec.marks.len()).collect();
     let Some(as_given) = reading(rec, shape, &given, false) else { return (Vec::new(), 1.0) };
-    let limit = SAME.max(SAME_SIGMAS * rec.noise.marks_m.value / rec.size());
+    let limit = MAX_MISFIT.max(MAX_MISFIT_SIGMAS * rec.noise.marks_m.value / rec.size());
     if as_given.misfit < limit {
         return (Vec::new(), as_given.scale);
     }
@@ -83,27 +84,30 @@ pub(super) fn check(rec: &Recording, shape: &Shape) -> (Vec<Finding>, f64) {
             }
         }
     }
-    let finding = match best.filter(|b| b.misfit < limit && b.misfit * BETTER < as_given.misfit) {
+    let finding = match best.filter(|b| b.misfit < limit && b.misfit * MIN_IMPROVEMENT < as_given.misfit) {
         Some(b) => explained(rec, shape, &as_given, &b),
         None => unexplained(rec, shape, &as_given),
     };
     (vec![finding], as_given.scale)
 }
 
-/// A wrong unit of the marks or of the rig, in words; `arm` is lengths of the arm over those of the cameras, where
-/// known.
+/// Finding for a wrong unit of the marks or of the rig; `arm` is the ratio of the arm's lengths to the cameras'
+/// lengths, if known.
 pub(super) fn scale_finding(rec: &Recording, scale: f64, arm: Option<f64>) -> Option<Finding> {
-    if (scale - 1.0).abs() < SCALE {
+    if (scale - 1.0).abs() < MAX_SCALE_ERROR {
         return None;
     }
-    // scale: cameras over file; arm: arm over cameras. Whoever differs from the two others is at fault.
+    // scale: cameras over file; arm: arm over cameras. The length that differs from the other two is wrong.
     let near = |v: f64| (v - 1.0).abs() < 0.1;
     let (code, who, factor) = match arm {
         Some(a) if !near(a) && near(a * scale) => ("rig-unit", "the rig's baseline", a),
         _ => ("marks-unit", "the marks", scale),
     };
-    let evidence = format!("the marks' distances are {scale:.4} times those of the file by the rig's baseline");
-    let arm = arm.map_or(String::new(), |a| format!(", and the arm moves {a:.4} times as far as the cameras see"));
+    let evidence =
+        format!("with the rig's baseline, the distances between marks are {scale:.4} times those of the file");
+    let arm = arm.map_or(String::new(), |a| {
+        format!(", and the arm moves {a:.4} times as far as the gripper does in the images")
+    });
     Some(Finding::new(
         code,
         (scale.ln()).abs(),
@@ -115,7 +119,7 @@ pub(super) fn scale_finding(rec: &Recording, scale: f64, arm: Option<f64>) -> Op
     ))
 }
 
-/// The name of a unit that is `factor` times what was expected.
+/// Name of the unit that is `factor` times the expected one.
 pub(super) fn unit_name(factor: f64) -> String {
     let off = |u: f64| (factor / u).ln().abs();
     match UNITS.iter().min_by(|a, b| off(a.0).total_cmp(&off(b.0))) {
@@ -141,7 +145,7 @@ fn mark(rec: &Recording, k: usize, mirrored: bool) -> Vec3 {
     if mirrored { Vec3::new(-m.x, m.y, m.z) } else { m }
 }
 
-/// Readings in other orders, found by one well-spread observed triangle laid on every triangle of the file.
+/// Readings in other orders: the largest observed triangle is aligned with every triangle of the file.
 fn reorder(rec: &Recording, shape: &Shape) -> Vec<Reading> {
     let known: Vec<(usize, Vec3)> = shape.points.iter().enumerate().filter_map(|(k, p)| p.map(|p| (k, p))).collect();
     let n = rec.marks.len();
@@ -168,7 +172,7 @@ fn reorder(rec: &Recording, shape: &Shape) -> Vec<Reading> {
         }
         let f = sides(triple.map(|k| rec.marks[k]));
         let ratio = (s[0] + s[1] + s[2]) / (f[0] + f[1] + f[2]);
-        if (0..3).any(|e| (s[e] / (ratio * f[e]) - 1.0).abs() > SIDES) {
+        if (0..3).any(|e| (s[e] / (ratio * f[e]) - 1.0).abs() > MAX_SIDE_MISMATCH) {
             continue;
         }
         for mirrored in [false, true] {
@@ -183,7 +187,7 @@ fn reorder(rec: &Recording, shape: &Shape) -> Vec<Reading> {
     out
 }
 
-/// Each observed mark's nearest placed mark, one to one; marks never observed take what is left.
+/// Assigns each observed mark to its nearest placed mark, one to one; marks without observation get the remaining ones.
 fn assign(n: usize, known: &[(usize, Vec3)], placed: &[Vec3]) -> Option<Vec<usize>> {
     let mut order = vec![usize::MAX; n];
     let mut taken = vec![false; n];
@@ -204,30 +208,30 @@ fn assign(n: usize, known: &[(usize, Vec3)], placed: &[Vec3]) -> Option<Vec<usiz
 }
 
 fn explained(rec: &Recording, shape: &Shape, given: &Reading, b: &Reading) -> Finding {
-    let moved = b.order.iter().enumerate().filter(|(k, o)| k != *o).map(|(k, o)| format!("{k} is the file's {o}"));
+    let moved = b.order.iter().enumerate().filter(|(k, o)| k != *o).map(|(k, o)| format!("{k} is the file's mark {o}"));
     let moved: Vec<String> = moved.collect();
     let (code, what) = match (b.mirrored, moved.is_empty()) {
         (true, true) => {
             ("marks-mirrored", "the marks are mirrored: one axis of marks_mm has the wrong sign".to_owned())
         }
-        (false, _) => ("marks-order", format!("the marks are in another order: seen mark {}", moved.join(", "))),
+        (false, _) => ("marks-order", format!("the marks are in another order: observed mark {}", moved.join(", "))),
         (true, false) => (
             "marks-mirrored-order",
-            format!("the marks are mirrored and in another order: seen mark {}", moved.join(", ")),
+            format!("the marks are mirrored and in another order: observed mark {}", moved.join(", ")),
         ),
     };
     let mm = |r: &Reading| r.misfit * rec.size() * r.scale * 1e3;
     let evidence = format!(
-        "as given, their shape misses what {} rests show by {:.2} mm (root mean square), so read by {:.2} mm",
+        "as given, their shape differs from that of {} rests by {:.2} mm (root mean square), in this reading by {:.2} mm",
         shape.rests,
         mm(given),
         mm(b)
     );
-    let fix = "put marks_mm right, or the numbering of the marks in the images";
+    let fix = "correct marks_mm, or the numbering of the marks in the images";
     Finding::new(code, given.misfit / b.misfit, format!("{}: {what}; {evidence}; {fix}", rec.name))
 }
 
-/// One mark out of place, or a shape of another gripper.
+/// Finding for one displaced mark, or for the shape of another gripper.
 fn unexplained(rec: &Recording, shape: &Shape, given: &Reading) -> Finding {
     let pairs: Vec<(usize, Vec3, Vec3)> =
         shape.points.iter().enumerate().filter_map(|(k, p)| p.map(|p| (k, rec.marks[k], p))).collect();
@@ -241,13 +245,13 @@ fn unexplained(rec: &Recording, shape: &Shape, given: &Reading) -> Finding {
     };
     let best = pairs.iter().filter_map(|p| without(p.0)).min_by(|a, b| a.1.total_cmp(&b.1));
     let size = rec.size() * given.scale * 1e3;
-    match best.filter(|b| b.1 < SAME && pairs.len() > 4) {
+    match best.filter(|b| b.1 < MAX_MISFIT && pairs.len() > 4) {
         Some((k, misfit, own)) => Finding::new(
             "marks-place",
             given.misfit / misfit,
             format!(
-                "{}: mark {k} stands {:.1} mm from where marks_mm says, by the other marks ({} rests, which agree to {:.2} mm without \
-                 it); measure it again, or check that its number is right in the images",
+                "{}: mark {k} is {:.1} mm from its position in marks_mm relative to the other marks ({} rests, which agree to {:.2} mm \
+                 without it); measure it again, or check its number in the images",
                 rec.name,
                 own * 1e3,
                 shape.rests,
@@ -258,8 +262,8 @@ fn unexplained(rec: &Recording, shape: &Shape, given: &Reading) -> Finding {
             "marks-shape",
             0.0,
             format!(
-                "{}: the marks do not have the shape of marks_mm: root mean square distance {:.1} mm over {} rests, in any order and \
-                 mirrored; check that the file describes this gripper, that left and right images belong together, and the rig",
+                "{}: the marks do not have the shape of marks_mm in any order, mirrored or not: root mean square distance {:.1} mm \
+                 over {} rests; check that the file describes this gripper, that left and right images belong together, and the rig",
                 rec.name,
                 given.misfit * size,
                 shape.rests

@@ -1,4 +1,4 @@
-//! The answer, and how it was come by.
+//! The result of a calibration, and findings about the stated noise.
 
 use super::bundle::POSES;
 use super::data::Recording;
@@ -9,10 +9,10 @@ use super::predict::{Prediction, predict};
 use graspd_rt::geom::{Pose, Rig, Vec3, View};
 use nalgebra::DMatrix;
 
-/// A sighting counts as a gross error when the chance that it is none is below this.
-const GROSS: f64 = 0.5;
+/// Minimum inlier probability of a sighting or a pose.
+const MIN_INLIER_PROBABILITY: f64 = 0.5;
 
-/// A sighting that the fit holds for a gross error.
+/// A sighting that the fit classifies as a gross error.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GrossError {
     /// Index of the pose.
@@ -21,16 +21,16 @@ pub struct GrossError {
     pub mark: usize,
     /// Which image.
     pub view: View,
-    /// Distance from where the fit puts the mark, pixels.
+    /// Distance from the fitted mark, pixels.
     pub px: f64,
 }
 
-/// A pose that the arm did not have when its images were taken, or reported of another point.
+/// A pose that the arm did not have when the images were taken, or that refers to another tool point.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ForeignPose {
+pub struct OutlierPose {
     /// Index of the pose.
     pub pose: usize,
-    /// The flange that fits the images, from the flange that was reported.
+    /// Fitted flange in the frame of the reported flange (maps fitted to reported coordinates).
     pub reported_from_fitted: Pose,
 }
 
@@ -43,32 +43,32 @@ pub struct Solution {
     pub base_from_left: Pose,
     /// Marks in the gripper's frame, metres.
     pub marks: Vec<Vec3>,
-    /// The rig in force, refined where the hypothesis says so.
+    /// The rig that the fit used, refined if the hypothesis includes an error of the rig.
     pub rig: Rig,
-    /// What the fit was made under.
+    /// Hypothesis of the fit.
     pub hypothesis: Hypothesis,
-    /// All hypotheses that were tried.
+    /// All hypotheses that were fitted.
     pub tried: Vec<Hypothesis>,
-    /// Covariance of: flange_from_gripper · exp(v, w), base_from_left · exp(v, w), marks (where free), rig parameters
-    /// (24, where free), in metres, rad and the rig's units.
+    /// Covariance of: flange_from_gripper · exp(v, w), base_from_left · exp(v, w), marks (if free), rig parameters
+    /// (24, if free), in metres, rad and the rig's units.
     pub covariance: DMatrix<f64>,
-    /// Standard deviations in force: pixels, flange position (m), flange orientation (rad), marks (m).
+    /// Standard deviations used: pixels, flange position (m), flange orientation (rad), marks (m).
     pub noise: [f64; 4],
-    /// Root mean square of the residuals of all sightings that are no gross errors, per axis, pixels.
+    /// Root mean square residual of all sightings without gross errors, per axis, pixels.
     pub residual_px: f64,
-    /// Sightings, and how many of them are no gross errors.
+    /// Number of sightings, and number of sightings without gross errors.
     pub sightings: [usize; 2],
     /// Gross errors.
     pub gross: Vec<GrossError>,
-    /// Poses of another origin.
-    pub foreign: Vec<ForeignPose>,
-    /// Flange corrections, reported from true, a pose each.
+    /// Poses that do not fit the arm.
+    pub outlier_poses: Vec<OutlierPose>,
+    /// Flange corrections, one per pose; each maps true-flange to reported-flange coordinates.
     pub flange: Vec<Pose>,
     /// Predicted errors at the recorded poses.
     pub predicted: Prediction,
-    /// What to do to make it better; empty when the tolerance is met.
+    /// Motions that would improve the result; empty if the tolerance is met.
     pub advice: Vec<Advice>,
-    /// What a person has to know.
+    /// Findings for the user.
     pub findings: Vec<Finding>,
 }
 
@@ -79,14 +79,14 @@ impl Solution {
     }
 }
 
-/// Gathers the answer; findings and advice are added by those who know them.
+/// Collects the result; the caller adds findings and advice.
 pub(super) fn gather(rec: &Recording, chosen: &Chosen<'_>) -> Solution {
     let (fit, model) = (&chosen.fit, &chosen.model);
     let (mut gross, mut sum, mut good, mut all) = (Vec::new(), 0.0, 0.0, 0);
     for (i, (rows, weights)) in model.rows.iter().zip(&fit.rows).enumerate() {
         for (row, &(w, r2)) in rows.iter().zip(weights) {
             all += 1;
-            if w < GROSS {
+            if w < MIN_INLIER_PROBABILITY {
                 gross.push(GrossError { pose: i, mark: row.mark, view: row.view, px: r2.sqrt() });
             } else {
                 sum += w * r2;
@@ -94,8 +94,9 @@ pub(super) fn gather(rec: &Recording, chosen: &Chosen<'_>) -> Solution {
             }
         }
     }
-    let foreign = fit.ordinary.iter().enumerate().filter(|(_, w)| **w < GROSS);
-    let foreign = foreign.map(|(pose, _)| ForeignPose { pose, reported_from_fitted: fit.state.flange[pose] }).collect();
+    let outlier_poses = fit.ordinary.iter().enumerate().filter(|(_, w)| **w < MIN_INLIER_PROBABILITY);
+    let outlier_poses =
+        outlier_poses.map(|(pose, _)| OutlierPose { pose, reported_from_fitted: fit.state.flange[pose] }).collect();
     let flanges: Vec<Pose> = rec.poses.iter().map(|p| p.base_from_flange).collect();
     let k = &fit.scales;
     Solution {
@@ -110,7 +111,7 @@ pub(super) fn gather(rec: &Recording, chosen: &Chosen<'_>) -> Solution {
         residual_px: (sum / (2.0 * good).max(1e-300)).sqrt(),
         sightings: [all, all - gross.len()],
         gross,
-        foreign,
+        outlier_poses,
         flange: fit.state.flange.clone(),
         predicted: predict(model, &fit.state, &fit.covariance, &flanges),
         advice: Vec::new(),
@@ -118,7 +119,7 @@ pub(super) fn gather(rec: &Recording, chosen: &Chosen<'_>) -> Solution {
     }
 }
 
-/// The covariance with the rig's own parameters in place of the prior's unknowns.
+/// The covariance, with the rig's parameters instead of the unknowns of the prior.
 fn in_rig_parameters(chosen: &Chosen<'_>) -> DMatrix<f64> {
     let (c, factor) = (&chosen.fit.covariance, &chosen.model.prior.factor);
     if factor.ncols() == 0 {
@@ -131,14 +132,14 @@ fn in_rig_parameters(chosen: &Chosen<'_>) -> DMatrix<f64> {
     &t * c * t.transpose()
 }
 
-/// Deviations of the noise further than this factor from what was stated are said: sampling error of a hundred values
-/// is 7 %.
-const MISSTATED: f64 = 1.6;
-/// A stated rig covariance is contradicted when the squared length of the offset, in its deviations, is this
-/// improbable: mean plus five standard deviations of χ².
-const IMPROBABLE: f64 = 5.0;
+/// Maximum ratio, in either direction, of an estimated standard deviation to the stated one without a finding: the
+/// sampling error of a hundred values is 7 %.
+const MAX_SIGMA_RATIO: f64 = 1.6;
+/// Maximum squared length of the rig's offset, whitened by the stated covariance: mean of χ² plus this many of its
+/// standard deviations.
+const MAX_CHI2_SIGMAS: f64 = 5.0;
 
-/// What was stated about noise and rig, and is not so.
+/// Findings about stated noise and rig covariance that the residuals contradict.
 pub(super) fn misstated(rec: &Recording, chosen: &Chosen<'_>) -> Vec<Finding> {
     let (k, n) = (&chosen.fit.scales, &rec.noise);
     let mut out = Vec::new();
@@ -148,30 +149,35 @@ pub(super) fn misstated(rec: &Recording, chosen: &Chosen<'_>) -> Vec<Finding> {
         ("flange_deg", n.flange_rad, k.flange_rad, "deg", 1_f64.to_degrees()),
     ] {
         let ratio = now / sigma.value;
-        if sigma.stated && !(1.0 / MISSTATED..=MISSTATED).contains(&ratio) {
-            let words = format!(
-                "{}: noise.{what} is stated as {:.3e} {unit}, and the residuals speak for {:.3e}; what they say is used{}",
+        if sigma.stated && !(1.0 / MAX_SIGMA_RATIO..=MAX_SIGMA_RATIO).contains(&ratio) {
+            let message = format!(
+                "{}: noise.{what} is stated as {:.3e} {unit}, but the residuals give {:.3e} {unit}; the estimate is used{}",
                 rec.name,
                 sigma.value * per,
                 now * per,
-                if what == "flange_deg" && ratio > 20.0 { " (radians where degrees are meant?)" } else { "" }
+                if what == "flange_deg" && ratio > 20.0 { " (radians instead of degrees?)" } else { "" }
             );
-            out.push(Finding::new("noise-misstated", ratio.ln().abs(), words));
+            out.push(Finding::new("noise-misstated", ratio.ln().abs(), message));
         }
     }
     let h = &chosen.tried[chosen.best];
     if h.free_marks && n.marks_m.value == 0.0 {
-        let words =
-            format!("{}: the marks are stated as exact, and are off by {:.3} mm each axis", rec.name, k.marks_m * 1e3);
-        out.push(Finding::new("marks-not-exact", k.marks_m, words));
+        let message = format!(
+            "{}: the marks are stated as exact, but have errors of {:.3} mm per axis",
+            rec.name,
+            k.marks_m * 1e3
+        );
+        out.push(Finding::new("marks-not-exact", k.marks_m, message));
     }
     let u = &chosen.fit.state.u;
     let r = u.len() as f64;
-    if h.rig_stated && u.norm_squared() > r + IMPROBABLE * (2.0 * r).sqrt() {
+    if h.rig_stated && u.norm_squared() > r + MAX_CHI2_SIGMAS * (2.0 * r).sqrt() {
         let off = (u.norm_squared() / r).sqrt();
-        let words =
-            format!("{}: the rig is off by {off:.1} times what its covariance states; calibrate it again", rec.name);
-        out.push(Finding::new("rig-misstated", off, words));
+        let message = format!(
+            "{}: the error of the rig is {off:.1} times its stated standard deviation; calibrate the rig again",
+            rec.name
+        );
+        out.push(Finding::new("rig-misstated", off, message));
     }
     out
 }

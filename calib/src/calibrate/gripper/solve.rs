@@ -1,5 +1,5 @@
-//! The maximum of one hypothesis: Levenberg-Marquardt with the flange corrections eliminated, deviations estimated on
-//! the way.
+//! Maximizes the likelihood of one hypothesis: Levenberg-Marquardt with the flange corrections eliminated, alternating
+//! with the estimation of the standard deviations.
 
 use super::bundle::{Model, Normal, POSES, Scales, State};
 use super::data::{Noise, Sigma};
@@ -7,67 +7,69 @@ use super::error::GripperError;
 use nalgebra::{DMatrix, DVector, Matrix6, SymmetricEigen, Vector6};
 use std::f64::consts::TAU;
 
-/// How much a stated standard deviation is believed, in degrees of freedom: it is taken as known to 10 %, since the
-/// variance of an estimate from n values has the relative deviation sqrt(2 / n).
+/// Degrees of freedom of the prior of a stated standard deviation: known to 10 %, since a variance estimated from n
+/// values has the relative standard deviation sqrt(2 / n).
 const STATED_FREEDOM: f64 = 50.0;
 /// The same for a default: known to a factor of two or three.
 const DEFAULT_FREEDOM: f64 = 1.0;
-/// How far above the stated and the default deviation of the flange its estimate starts.
-const ABOVE: f64 = 3.0;
-/// Prior sightings behind the stated share of gross errors.
+/// Initial flange standard deviation as a multiple of the larger of the stated and the default one.
+const START_FACTOR: f64 = 3.0;
+/// Weight of the stated outlier fraction, as a number of sightings.
 const OUTLIER_COUNT: f64 = 50.0;
-/// Prior poses behind the share of foreign ones, which is one in a hundred.
-const FOREIGN_COUNT: f64 = 20.0;
-const FOREIGN_SHARE: f64 = 0.01;
-/// Smallest shares: even a clean recording may have a first gross error.
-const LEAST_SHARE: f64 = 1e-3;
-/// Multiples of the pixel deviation on the way from a rough start to the likelihood itself.
+/// Weight of the prior fraction of outlier poses, as a number of poses.
+const OUTLIER_POSE_COUNT: f64 = 20.0;
+/// Prior fraction of outlier poses.
+const OUTLIER_POSE_FRACTION: f64 = 0.01;
+/// Minimum outlier fraction: a recording without outliers so far may still contain one.
+const MIN_OUTLIER_FRACTION: f64 = 1e-3;
+/// Annealing from a rough initial estimate: multiples of the pixel standard deviation.
 const COOLING: [f64; 6] = [64.0, 32.0, 16.0, 8.0, 4.0, 2.0];
-/// Steps at each multiple.
+/// Maximum number of steps at each multiple.
 const COOLING_STEPS: usize = 4;
-/// Steps between two estimates of the deviations, and how often they are estimated at most.
-const STEPS: usize = 8;
-const ROUNDS: usize = 20;
-/// The deviations rest when none changes by more than this, relative.
-const SETTLED: f64 = 1e-3;
-/// A step this small in deviations changes nothing.
-const STILL: f64 = 1e-4;
-/// Smallest eigenvalue of the correlation-scaled information that double precision can tell from zero.
-const EIGEN_FLOOR: f64 = 1e-13;
+/// Maximum number of steps between two estimates of the standard deviations.
+const MAX_STEPS: usize = 8;
+/// Maximum number of estimates of the standard deviations.
+const MAX_ROUNDS: usize = 20;
+/// Maximum relative change of the standard deviations at convergence.
+const MAX_SCALE_CHANGE: f64 = 1e-3;
+/// Maximum length of a negligible step, in posterior standard deviations.
+const MAX_NEGLIGIBLE_STEP: f64 = 1e-4;
+/// Minimum eigenvalue of the correlation-scaled information that double precision distinguishes from zero.
+const MIN_EIGENVALUE: f64 = 1e-13;
 
-/// The maximum of a hypothesis and its shape.
+/// Maximum of the likelihood of a hypothesis, with its curvature.
 #[derive(Debug)]
 pub(super) struct Fit {
     pub(super) state: State,
     pub(super) scales: Scales,
     /// Covariance of the global unknowns: flange_from_gripper (v, w), base_from_left (v, w), marks, the rig's.
     pub(super) covariance: DMatrix<f64>,
-    /// Each sighting's probability of being no gross error and its squared residual, pixels.
+    /// Inlier probability and squared residual (px²) of each sighting.
     pub(super) rows: Vec<Vec<(f64, f64)>>,
-    /// Each pose's probability of an ordinary flange error.
+    /// Probability of an ordinary flange error, for each pose.
     pub(super) ordinary: Vec<f64>,
-    /// Logarithm of the evidence, up to what all hypotheses share.
+    /// Logarithm of the evidence, up to a constant common to all hypotheses.
     pub(super) evidence: f64,
 }
 
-/// Deviations before anything is estimated. Those of the flange start above any that may be right: from below,
-/// corrections that are held to nothing say nothing, and the estimate would stay where it is.
+/// Initial standard deviations. Those of the flange start above any plausible value: with values that are too small the
+/// flange corrections stay at zero, contain no information, and the estimate does not increase.
 pub(super) fn first_scales(n: &Noise) -> Scales {
     let d = Noise::default();
     Scales {
         px: n.mark_px.value,
-        flange_m: ABOVE * n.flange_m.value.max(d.flange_m.value),
-        flange_rad: ABOVE * n.flange_rad.value.max(d.flange_rad.value),
+        flange_m: START_FACTOR * n.flange_m.value.max(d.flange_m.value),
+        flange_rad: START_FACTOR * n.flange_rad.value.max(d.flange_rad.value),
         marks_m: n.marks_m.value.max(1e-9),
-        outliers: n.outliers.max(LEAST_SHARE),
-        foreign: FOREIGN_SHARE,
+        outliers: n.outliers.max(MIN_OUTLIER_FRACTION),
+        outlier_poses: OUTLIER_POSE_FRACTION,
     }
 }
 
-/// Fits a hypothesis; `rough` cools down from a rough start.
+/// Fits a hypothesis; `rough` enables annealing from a rough initial estimate.
 ///
 /// # Errors
-/// When the fit does not come to rest.
+/// The objective is not finite at the start, or the information about the flange corrections is not positive definite.
 pub(super) fn fit(
     model: &Model<'_>,
     start: State,
@@ -78,12 +80,12 @@ pub(super) fn fit(
     let mut state = start;
     if rough {
         for by in COOLING {
-            let warm = Scales { px: scales.px * by, ..scales };
-            state = descend(model, state, &warm, COOLING_STEPS)?.0;
+            let annealed = Scales { px: scales.px * by, ..scales };
+            state = descend(model, state, &annealed, COOLING_STEPS)?.0;
         }
     }
-    for _ in 0..ROUNDS {
-        let (next, still) = descend(model, state, &scales, STEPS)?;
+    for _ in 0..MAX_ROUNDS {
+        let (next, still) = descend(model, state, &scales, MAX_STEPS)?;
         state = next;
         let normal = model.normal(&state, &scales);
         let inverse = Inverse::of(&normal)?;
@@ -95,22 +97,22 @@ pub(super) fn fit(
             again.marks_m / scales.marks_m,
         ];
         scales = again;
-        if still && change.iter().all(|c| (c - 1.0).abs() < SETTLED) {
+        if still && change.iter().all(|c| (c - 1.0).abs() < MAX_SCALE_CHANGE) {
             break;
         }
     }
-    let (state, _) = descend(model, state, &scales, STEPS)?;
+    let (state, _) = descend(model, state, &scales, MAX_STEPS)?;
     let normal = model.normal(&state, &scales);
     let inverse = Inverse::of(&normal)?;
     let evidence = evidence(model, &state, noise, &scales, &inverse);
     Ok(Fit { state, scales, covariance: inverse.global, rows: normal.rows, ordinary: normal.ordinary, evidence })
 }
 
-/// At most `steps` steps downhill; whether the last one was negligible.
+/// Takes at most `steps` steps downhill; also returns whether the last one was negligible.
 fn descend(model: &Model<'_>, mut state: State, scales: &Scales, steps: usize) -> Result<(State, bool), GripperError> {
     let mut value = model.objective(&state, scales);
     if !value.is_finite() {
-        return Err(GripperError::NotConverged("the likelihood is not finite at the start".into()));
+        return Err(GripperError::NotConverged("the likelihood is not finite at the initial estimate".into()));
     }
     let mut damping = 1e-6;
     for _ in 0..steps {
@@ -130,19 +132,19 @@ fn descend(model: &Model<'_>, mut state: State, scales: &Scales, steps: usize) -
                 break;
             }
         }
-        // No step goes down: this is the minimum to rounding.
+        // No step decreases the objective: this is the minimum to rounding.
         let Some((next, f, length)) = moved else { return Ok((state, true)) };
         state = next;
         value = f;
         damping *= 0.1;
-        if length < STILL {
+        if length < MAX_NEGLIGIBLE_STEP {
             return Ok((state, true));
         }
     }
     Ok((state, false))
 }
 
-/// A damped step: global, local, and its length in deviations.
+/// A damped step: global part, local parts, and its length in posterior standard deviations.
 fn step(n: &Normal, damping: f64) -> Option<(DVector<f64>, Vec<Vector6<f64>>, f64)> {
     let mut s = n.h.clone();
     let mut g = n.g.clone();
@@ -169,7 +171,7 @@ fn step(n: &Normal, damping: f64) -> Option<(DVector<f64>, Vec<Vector6<f64>>, f6
     Some((global, local, length))
 }
 
-/// Inverse of the information: the global block, each pose's own block, and the logarithm of the determinant.
+/// Inverse of the information: the global block, one block per pose, and the logarithm of the determinant.
 struct Inverse {
     global: DMatrix<f64>,
     local: Vec<Matrix6<f64>>,
@@ -178,7 +180,9 @@ struct Inverse {
 
 impl Inverse {
     fn of(n: &Normal) -> Result<Self, GripperError> {
-        let fail = || GripperError::NotConverged("the information about the flange corrections is not positive".into());
+        let fail = || {
+            GripperError::NotConverged("the information about the flange corrections is not positive definite".into())
+        };
         let mut s = n.h.clone();
         let mut log_det = 0.0;
         let mut parts = Vec::with_capacity(n.a.len());
@@ -201,20 +205,20 @@ impl Inverse {
     }
 }
 
-/// Inverse and log-determinant of an information matrix, by the eigenvalues of its correlation form, none of them below
-/// rounding.
+/// Inverse and log-determinant of an information matrix, from the eigenvalues of its correlation form, which are
+/// clamped to `MIN_EIGENVALUE`.
 pub(super) fn inverse_of(s: &DMatrix<f64>) -> (DMatrix<f64>, f64) {
     let n = s.nrows();
     let d = DVector::from_fn(n, |j, _| s[(j, j)].abs().sqrt().max(1e-150));
     let scaled = DMatrix::from_fn(n, n, |i, j| 0.5 * (s[(i, j)] + s[(j, i)]) / (d[i] * d[j]));
     let eigen = SymmetricEigen::new(scaled);
-    let values = eigen.eigenvalues.map(|v| v.max(EIGEN_FLOOR));
+    let values = eigen.eigenvalues.map(|v| v.max(MIN_EIGENVALUE));
     let half = DMatrix::from_fn(n, n, |i, j| eigen.eigenvectors[(i, j)] / (d[i] * values[j].sqrt()));
     let log_det = values.map(f64::ln).sum() + 2.0 * d.map(f64::ln).sum();
     (&half * half.transpose(), log_det)
 }
 
-/// The deviations that the residuals speak for, each held by what was stated: σ² = (Σ r² + ν σ0²) / (redundancy + ν).
+/// Standard deviations estimated from the residuals and their priors: σ² = (Σ r² + ν σ0²) / (redundancy + ν).
 fn estimate(model: &Model<'_>, s: &State, n: &Normal, inverse: &Inverse, noise: &Noise, k: &Scales) -> Scales {
     let g = &inverse.global;
     let (mut absorbed_t, mut absorbed_r, mut sum_t, mut sum_r, mut weight) = (0.0, 0.0, 0.0, 0.0, 0.0);
@@ -230,8 +234,8 @@ fn estimate(model: &Model<'_>, s: &State, n: &Normal, inverse: &Inverse, noise: 
     let absorbed_m = of_marks / (k.marks_m * k.marks_m);
     let absorbed_u: f64 = (POSES + marks..g.nrows()).map(|j| g[(j, j)]).sum();
     let sum_m: f64 = s.marks.iter().zip(&model.rec.marks).map(|(a, b)| (a - b).norm_squared()).sum();
-    // Each unknown's information comes from its prior or from the pixels: what the priors do not supply, the pixels
-    // have spent.
+    // The information about each unknown comes from its prior or from the pixels. The degrees of freedom that the
+    // priors do not determine are used up by the pixels.
     let unknowns = (POSES + marks + s.u.len() + 6 * s.flange.len()) as f64;
     let spent = unknowns - absorbed_t - absorbed_r - absorbed_m - absorbed_u;
     let (mut sum_px, mut seen, mut all) = (0.0, 0.0, 0.0);
@@ -246,15 +250,16 @@ fn estimate(model: &Model<'_>, s: &State, n: &Normal, inverse: &Inverse, noise: 
         let nu = freedom(prior);
         ((sum + nu * prior.value * prior.value) / (redundancy.max(0.0) + nu)).sqrt()
     };
-    let prior_outliers = noise.outliers.max(LEAST_SHARE);
+    let prior_outliers = noise.outliers.max(MIN_OUTLIER_FRACTION);
     Scales {
         px: ask(sum_px, 2.0 * seen - spent, noise.mark_px),
         flange_m: ask(sum_t, 3.0 * weight - absorbed_t, noise.flange_m),
         flange_rad: ask(sum_r, 3.0 * weight - absorbed_r, noise.flange_rad),
         marks_m: if marks > 0 { ask(sum_m, marks as f64 - absorbed_m, noise.marks_m) } else { k.marks_m },
-        outliers: ((all - seen + OUTLIER_COUNT * prior_outliers) / (all + OUTLIER_COUNT)).clamp(LEAST_SHARE, 0.5),
-        foreign: (s.flange.len() as f64 - weight + FOREIGN_COUNT * FOREIGN_SHARE)
-            / (s.flange.len() as f64 + FOREIGN_COUNT),
+        outliers: ((all - seen + OUTLIER_COUNT * prior_outliers) / (all + OUTLIER_COUNT))
+            .clamp(MIN_OUTLIER_FRACTION, 0.5),
+        outlier_poses: (s.flange.len() as f64 - weight + OUTLIER_POSE_COUNT * OUTLIER_POSE_FRACTION)
+            / (s.flange.len() as f64 + OUTLIER_POSE_COUNT),
     }
 }
 
@@ -262,17 +267,19 @@ fn freedom(s: Sigma) -> f64 {
     if s.stated { STATED_FREEDOM } else { DEFAULT_FREEDOM }
 }
 
-/// Logarithm of the evidence by Laplace's approximation, the deviations' own priors included.
+/// Logarithm of the evidence by Laplace's approximation, including the priors of the standard deviations.
 fn evidence(model: &Model<'_>, s: &State, noise: &Noise, k: &Scales, inverse: &Inverse) -> f64 {
     let unknowns = (model.globals() + 6 * s.flange.len()) as f64;
-    let held = |sigma: f64, prior: Sigma| {
+    let prior_cost = |sigma: f64, prior: Sigma| {
         let ratio = sigma / prior.value;
         0.5 * freedom(prior) * (1.0 / (ratio * ratio) + 2.0 * ratio.ln())
     };
     let mut f = model.objective(s, k);
-    f += held(k.px, noise.mark_px) + held(k.flange_m, noise.flange_m) + held(k.flange_rad, noise.flange_rad);
+    f += prior_cost(k.px, noise.mark_px)
+        + prior_cost(k.flange_m, noise.flange_m)
+        + prior_cost(k.flange_rad, noise.flange_rad);
     if model.free_marks {
-        f += held(k.marks_m, noise.marks_m);
+        f += prior_cost(k.marks_m, noise.marks_m);
     }
     -f + 0.5 * unknowns * TAU.ln() - 0.5 * inverse.log_det
 }

@@ -1,5 +1,5 @@
-//! The gripper's pose in the left camera, one rest at a time, whatever the arm says: consensus over both views' marks,
-//! then the pixels.
+//! The gripper's pose in the left camera at one rest, independent of the arm: consensus over the triangulated marks,
+//! then refinement on the pixels.
 
 use super::align::{consensus, median, triangulate};
 use super::data::{ArmPose, Recording};
@@ -7,17 +7,17 @@ use super::rig_prior::skew;
 use graspd_rt::geom::{Pixel, Pose, Rig, Vec3, View, exp_twist};
 use nalgebra::{Matrix2x6, Matrix6, Vector6};
 
-/// Steps of the refinement.
-const STEPS: usize = 12;
-/// A residual's weight falls with this many robust deviations (Cauchy's 95 % efficiency on normal residuals).
+/// Maximum number of steps of the refinement.
+const MAX_STEPS: usize = 12;
+/// Scale of the Cauchy weight, in robust standard deviations (95 % efficiency for normal residuals).
 const CAUCHY: f64 = 2.385;
-/// Median to deviation of the length of a two-dimensional normal vector.
+/// Ratio of the standard deviation per axis to the median length of a two-dimensional normal vector.
 const MEDIAN_TO_SIGMA: f64 = 1.0 / 1.177;
 
-/// A mark's pixels in both views and its index.
+/// Index of a mark and its pixels in both views.
 type Sighted = (usize, [Option<Pixel>; 2]);
 
-/// Marks of a rest that both views show, triangulated.
+/// Triangulated marks of a rest, for marks detected in both views.
 pub(super) fn in_space(rig: &Rig, rest: &ArmPose) -> Vec<(usize, Vec3)> {
     let both = rest.marks.iter().filter_map(|s| match s.px {
         [Some(l), Some(r)] => triangulate(rig, [l, r]).map(|x| (s.mark, x)),
@@ -26,8 +26,8 @@ pub(super) fn in_space(rig: &Rig, rest: &ArmPose) -> Vec<(usize, Vec3)> {
     both.collect()
 }
 
-/// The gripper's pose at a rest (`left_from_gripper`); `None` when fewer than three marks are in both views, or no pose
-/// explains half of them.
+/// The gripper's pose at a rest (`left_from_gripper`); `None` if fewer than three marks are in both views, if all of
+/// them are collinear, or if the refinement fails.
 pub(super) fn view_pose(rec: &Recording, marks: &[Vec3], rest: &ArmPose) -> Option<Pose> {
     let pairs: Vec<(Vec3, Vec3)> = in_space(&rec.rig, rest).into_iter().map(|(k, x)| (marks[k], x)).collect();
     let (start, _) = consensus(&pairs)?;
@@ -37,7 +37,7 @@ pub(super) fn view_pose(rec: &Recording, marks: &[Vec3], rest: &ArmPose) -> Opti
 
 fn refine(rec: &Recording, marks: &[Vec3], seen: &[Sighted], mut pose: Pose) -> Option<Pose> {
     let mut scale = spread(rec, marks, seen, &pose)?;
-    for _ in 0..STEPS {
+    for _ in 0..MAX_STEPS {
         let (mut h, mut g) = (Matrix6::<f64>::zeros(), Vector6::<f64>::zeros());
         let c = (CAUCHY * scale * MEDIAN_TO_SIGMA).max(rec.noise.mark_px.value);
         for (k, px) in seen {
@@ -61,7 +61,8 @@ fn refine(rec: &Recording, marks: &[Vec3], seen: &[Sighted], mut pose: Pose) -> 
         let d = h.cholesky()?.solve(&g);
         let next = pose * exp_twist(&d);
         let after = spread(rec, marks, seen, &next)?;
-        // Outliers of the median may let it rise a little; a start that runs away is kept where it was.
+        // The median may rise slightly because of outliers. If it rises further, the refinement diverges: keep the last
+        // pose.
         if after > 2.0 * scale + rec.noise.mark_px.value {
             break;
         }

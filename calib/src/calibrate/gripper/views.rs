@@ -1,21 +1,21 @@
-//! Do the two images and the rig belong to each other? Answered by the marks' own rays, before anything else is
-//! believed.
+//! Checks that the two images and the rig are consistent, using only the rays of the marks. This check runs before all
+//! others.
 
 use super::align::{median, triangulate};
 use super::data::Recording;
 use super::error::Finding;
 use graspd_rt::geom::{Pixel, Rig, Vec3, View};
 
-/// Median distance of a mark from its triangulated place, pixels, up to which rig and images may belong to each other:
-/// a rig that is off by ten times the deviations of a careful calibration leaves some 10 px.
-const SAME_PX: f64 = 10.0;
-/// An explanation has to fit this many times better than what was given.
-const BETTER: f64 = 5.0;
+/// Maximum median reprojection error of the triangulated marks, pixels, for rig and images to be consistent: a rig with
+/// ten times the errors of a careful calibration leaves about 10 px.
+const MAX_MISFIT_PX: f64 = 10.0;
+/// Minimum ratio of the misfit as given to the misfit of an alternative explanation.
+const MIN_IMPROVEMENT: f64 = 5.0;
 
-/// What contradicts the rig, if anything.
+/// Returns the contradiction between rig and images, if there is one.
 pub(super) fn check(rec: &Recording) -> Option<Finding> {
     let given = misfit(&rec.rig, rec, false);
-    if !(given > SAME_PX) {
+    if !(given > MAX_MISFIT_PX) {
         return None;
     }
     let inverse = Rig { right_from_left: rec.rig.right_from_left.inverse(), ..rec.rig };
@@ -27,14 +27,14 @@ pub(super) fn check(rec: &Recording) -> Option<Finding> {
         ("rig-cameras-swapped", "the rig's cameras are exchanged", misfit(&exchanged, rec, false), "exchange them"),
     ];
     let best = tried.into_iter().min_by(|a, b| a.2.total_cmp(&b.2));
-    let seen = format!("the marks miss the place where both rays meet by {given:.1} px (median)");
-    match best.filter(|b| b.2 * BETTER < given) {
+    let seen = format!("the marks are {given:.1} px (median) from the reprojection of their triangulated positions");
+    match best.filter(|b| b.2 * MIN_IMPROVEMENT < given) {
         Some((code, what, fits, fix)) => {
-            let words = format!("{}: {what}: as given, {seen}, read so by {fits:.2} px; {fix}", rec.name);
-            Some(Finding::new(code, given / fits, words))
+            let message = format!("{}: {what}: as given, {seen}, in this reading {fits:.2} px; {fix}", rec.name);
+            Some(Finding::new(code, given / fits, message))
         }
         None => {
-            let fix = "check that left and right were taken at the same time, and with this rig";
+            let fix = "check that left and right images were taken at the same time and with this rig";
             Some(Finding::new(
                 "views-unrelated",
                 0.0,
@@ -44,7 +44,7 @@ pub(super) fn check(rec: &Recording) -> Option<Finding> {
     }
 }
 
-/// Median distance of a mark's pixels from its triangulated place, pixels; 1000 for a place behind a camera.
+/// Median reprojection error of the triangulated marks, pixels; 1000 px for a point behind a camera.
 fn misfit(rig: &Rig, rec: &Recording, exchanged: bool) -> f64 {
     let mut all = Vec::new();
     for s in rec.poses.iter().flat_map(|p| &p.marks) {

@@ -1,12 +1,12 @@
-//! Every assumption that can be wrong is named when it is, and none is when it is not.
+//! Every wrong assumption is reported by its code, and a consistent recording has no findings.
 
-use super::world::{Wish, World};
+use super::world::{World, WorldSpec};
 use crate::calibrate::gripper::data::Recording;
 use crate::calibrate::gripper::{GripperError, calibrate, parse};
 use graspd_rt::geom::{Pose, Vec3};
 use nalgebra::{Translation3, UnitQuaternion};
 
-/// The codes of what a recording is refused for.
+/// Codes of the errors or findings of a recording.
 fn codes(rec: &Recording) -> Vec<&'static str> {
     match calibrate(rec, 1e-3) {
         Err(GripperError::Contradiction(list)) => list.iter().map(|f| f.code).collect(),
@@ -26,7 +26,7 @@ fn scaled(p: &Pose, by: f64) -> Pose {
 }
 
 #[test]
-fn each_contradiction_is_named() {
+fn each_contradiction_is_reported() {
     let cases: [(&str, Change); 12] = [
         ("marks-order", |r| r.marks.swap(0, 1)),
         ("marks-order", |r| r.marks.rotate_left(3)),
@@ -48,7 +48,7 @@ fn each_contradiction_is_named() {
         ("views-swapped", |r| r.poses.iter_mut().flat_map(|p| &mut p.marks).for_each(|s| s.px.swap(0, 1))),
     ];
     for seed in [11, 12] {
-        let world = World::new(Wish { seed, outliers: 0.02, marks_m: 2e-4, ..Wish::default() });
+        let world = World::new(WorldSpec { seed, outliers: 0.02, marks_m: 2e-4, ..WorldSpec::default() });
         assert_eq!(codes(&world.rec), Vec::<&str>::new(), "seed {seed}");
         for (code, change) in cases {
             let mut rec = world.rec.clone();
@@ -63,38 +63,38 @@ fn each_contradiction_is_named() {
 }
 
 #[test]
-fn a_tool_point_that_is_not_the_flange_is_named_with_its_place() {
-    let world = World::new(Wish { seed: 21, ..Wish::default() });
+fn tool_point_other_than_the_flange_is_reported_with_its_position() {
+    let world = World::new(WorldSpec { seed: 21, ..WorldSpec::default() });
     let tool = Pose::from_parts(Translation3::new(0.0, 0.0, 0.15), UnitQuaternion::identity());
-    // For some of the poses: changed while recording.
+    // For a subset of the poses: changed while recording.
     let mut rec = world.rec.clone();
     flanges(&mut rec, |i, p| if i < 8 { p * tool } else { *p });
     let s = calibrate(&rec, 1e-3).unwrap();
     assert_eq!(s.findings.iter().map(|f| f.code).collect::<Vec<_>>(), ["tcp"]);
-    assert!((7..=8).contains(&s.foreign.len()), "{:?}", s.foreign);
-    let d = s.foreign[0].reported_from_fitted.inverse().translation.vector - Vec3::new(0.0, 0.0, 0.15);
+    assert!((7..=8).contains(&s.outlier_poses.len()), "{:?}", s.outlier_poses);
+    let d = s.outlier_poses[0].reported_from_fitted.inverse().translation.vector - Vec3::new(0.0, 0.0, 0.15);
     assert!(d.norm() < 3e-3, "{d}");
-    // For all of them, against where the gripper is assumed to sit.
+    // For all poses, compared with the assumed mounting.
     rec = world.rec.clone();
     rec.assumed = Some(world.x);
     assert_eq!(codes(&rec), Vec::<&str>::new());
     flanges(&mut rec, |_, p| p * tool);
     let s = calibrate(&rec, 1e-3).unwrap();
-    assert!(s.findings[0].code == "tcp" && s.findings[0].words.contains("pendant's TCP"), "{:?}", s.findings);
-    assert!(s.findings[0].words.contains("150."), "{}", s.findings[0].words);
-    // Set to the gripper's own frame.
+    assert!(s.findings[0].code == "tcp" && s.findings[0].message.contains("pendant's TCP"), "{:?}", s.findings);
+    assert!(s.findings[0].message.contains("150."), "{}", s.findings[0].message);
+    // TCP set to the gripper's frame.
     rec = world.rec.clone();
     flanges(&mut rec, |_, p| p * world.x);
     assert_eq!(codes(&rec), ["tcp"]);
-    // One pose at which the arm still moved.
+    // One pose at which the arm was still moving.
     rec = world.rec.clone();
     flanges(&mut rec, |i, p| if i == 4 { p * Pose::translation(0.004, 0.01, 0.0) } else { *p });
     assert_eq!(codes(&rec), ["foreign-poses"]);
 }
 
 #[test]
-fn what_is_stated_wrongly_is_said() {
-    let world = World::new(Wish { seed: 31, marks_m: 5e-4, ..Wish::default() });
+fn misstated_noise_is_reported() {
+    let world = World::new(WorldSpec { seed: 31, marks_m: 5e-4, ..WorldSpec::default() });
     let mut rec = world.rec.clone();
     rec.noise.marks_m.value = 0.0;
     assert_eq!(codes(&rec), ["marks-not-exact"]);
@@ -104,16 +104,16 @@ fn what_is_stated_wrongly_is_said() {
 }
 
 #[test]
-fn bad_files_are_refused_by_key() {
+fn invalid_files_are_rejected_by_key() {
     let good: serde_json::Value =
         serde_json::from_str(include_str!("../../../../tests/data/handeye/dev01.json")).unwrap();
-    let show = |path: &str, v: serde_json::Value| {
+    let error = |path: &str, v: serde_json::Value| {
         let mut d = good.clone();
         *d.pointer_mut(path).unwrap() = v;
         parse(&d.to_string(), "f.json", None).unwrap_err().to_string()
     };
     use serde_json::json;
-    for (path, v, words) in [
+    for (path, v, text) in [
         ("/kind", json!("eye-in-hand"), "fixed cameras"),
         ("/units/length", json!("inch"), "mm or m"),
         ("/marks_mm", json!([[0, 0, 0]]), "1 marks"),
@@ -126,8 +126,8 @@ fn bad_files_are_refused_by_key() {
         ("/rig/left/K/0/0", json!(-4.0), "rig.left"),
         ("/poses", json!([]), "0 poses"),
     ] {
-        let e = show(path, v);
-        assert!(e.starts_with("f.json") && e.contains(words), "{path}: {e}");
+        let e = error(path, v);
+        assert!(e.starts_with("f.json") && e.contains(text), "{path}: {e}");
     }
     let e = parse("{\"marks_mm\": [", "f.json", None).unwrap_err().to_string();
     assert!(e.starts_with("f.json:1:"), "{e}");

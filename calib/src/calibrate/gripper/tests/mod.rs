@@ -1,4 +1,4 @@
-//! Accuracy, honest covariance, gross errors, contradictions and missing motions, on worlds drawn from seeds.
+//! Accuracy, covariance consistency, gross errors, contradictions and missing motions on seeded synthetic worlds.
 
 mod contradictions;
 mod world;
@@ -7,16 +7,16 @@ use super::report::Verdict;
 use super::{calibrate, parse};
 use graspd_rt::geom::Pose;
 use serde_json::Value;
-use world::{Draw, Wish, World};
+use world::{Draw, World, WorldSpec};
 
 const SEEDS: std::ops::Range<u64> = 9000..9020;
 
 /// Means over the seeds: predicted error in metres and pixels, normalized squared error.
-fn means(wish: Wish) -> [f64; 3] {
+fn means(spec: WorldSpec) -> [f64; 3] {
     let mut sum = [0.0; 3];
     let n = (SEEDS.end - SEEDS.start) as f64;
     for seed in SEEDS {
-        let world = World::new(Wish { seed, ..wish });
+        let world = World::new(WorldSpec { seed, ..spec });
         let s = world.solve();
         let [m, px] = world.predicted(&s);
         for (sum, v) in sum.iter_mut().zip([m, px, world.normalized(&s)]) {
@@ -27,9 +27,9 @@ fn means(wish: Wish) -> [f64; 3] {
 }
 
 #[test]
-fn marks_known_exactly_with_and_without_gross_errors() {
-    let clean = means(Wish::default());
-    let dirty = means(Wish { outliers: 0.05, ..Wish::default() });
+fn exact_marks_with_and_without_gross_errors() {
+    let clean = means(WorldSpec::default());
+    let dirty = means(WorldSpec { outliers: 0.05, ..WorldSpec::default() });
     eprintln!("clean {clean:?} dirty {dirty:?}");
     for m in [clean, dirty] {
         assert!(m[0] < 1.7e-4 && m[1] < 0.09, "{m:?}");
@@ -39,24 +39,24 @@ fn marks_known_exactly_with_and_without_gross_errors() {
 }
 
 #[test]
-fn free_marks_and_small_turns_with_gross_errors() {
-    let m = means(Wish { marks_m: 5e-4, ..Wish::default() });
-    let small = means(Wish { marks_m: 5e-4, turn_deg: 25.0, outliers: 0.05, ..Wish::default() });
+fn free_marks_and_small_rotations_with_gross_errors() {
+    let m = means(WorldSpec { marks_m: 5e-4, ..WorldSpec::default() });
+    let small = means(WorldSpec { marks_m: 5e-4, turn_deg: 25.0, outliers: 0.05, ..WorldSpec::default() });
     eprintln!("marks {m:?} small {small:?}");
     assert!(m[0] < 2.1e-4 && m[1] < 0.1 && (0.7..1.3).contains(&m[2]), "{m:?}");
     assert!(small[0] < 3e-4 && small[1] < 0.1 && (0.7..1.3).contains(&small[2]), "{small:?}");
 }
 
 #[test]
-fn a_rig_that_is_off_is_refined() {
-    let m = means(Wish { marks_m: 5e-4, rig_off: true, ..Wish::default() });
+fn rig_with_errors_is_refined() {
+    let m = means(WorldSpec { marks_m: 5e-4, rig_off: true, ..WorldSpec::default() });
     eprintln!("rig {m:?}");
     assert!(m[0] < 1.7e-3 && m[1] < 0.10 && (0.7..1.3).contains(&m[2]), "{m:?}");
 }
 
-/// The shared sets' bars, on copies of them.
+/// Accuracy limits of the public data sets, on copies of them.
 #[test]
-fn the_public_sets_are_within_their_bars() {
+fn public_data_sets_are_within_their_accuracy_limits() {
     let sets = [
         (
             include_str!("../../../../tests/data/handeye/dev01.json"),
@@ -67,7 +67,7 @@ fn the_public_sets_are_within_their_bars() {
             include_str!("../../../../tests/data/handeye/dev02-marks.truth.json"),
         ),
     ];
-    for ((data, truth), bar) in sets.into_iter().zip([[1.1e-4, 0.08], [2.1e-4, 0.07]]) {
+    for ((data, truth), limit) in sets.into_iter().zip([[1.1e-4, 0.08], [2.1e-4, 0.07]]) {
         let rec = parse(data, "set", None).unwrap();
         let s = calibrate(&rec, 1e-3).unwrap();
         let truth: Value = serde_json::from_str(truth).unwrap();
@@ -84,7 +84,7 @@ fn the_public_sets_are_within_their_bars() {
             rec,
         };
         let [m, px] = world.predicted(&s);
-        assert!(m <= bar[0] && px <= bar[1], "{m} m, {px} px");
+        assert!(m <= limit[0] && px <= limit[1], "{m} m, {px} px");
         assert_eq!(s.verdict(1e-3), Verdict::Good);
         let json = s.to_json(&world.rec, 1e-3);
         let n = json["covariance"]["parameters"].as_array().unwrap().len();
@@ -99,35 +99,37 @@ fn pose(v: &Value) -> Pose {
     Pose::from_parts(nalgebra::Translation3::new(m[0][3] * 1e-3, m[1][3] * 1e-3, m[2][3] * 1e-3), q)
 }
 
-/// Turns about one tool axis leave the place along it open, and the advice is a turn about another; with it the
-/// tolerance is met.
+/// Rotations about one tool axis leave the position along it undetermined. The advice is a rotation about another axis,
+/// and with it the tolerance is met.
 #[test]
-fn the_missing_motion_is_named_and_sufficient() {
+fn advised_motion_is_sufficient() {
     for (axes, have, others) in
         [(&[2][..], "flange z", ["tool's x", "tool's y"]), (&[0][..], "tool's x", ["flange z", "tool's y"])]
     {
-        let world = World::new(Wish { axes: Some(axes), poses: 12, turn_deg: 30.0, seed: 77, ..Wish::default() });
+        let world =
+            World::new(WorldSpec { axes: Some(axes), poses: 12, turn_deg: 30.0, seed: 77, ..WorldSpec::default() });
         let s = world.solve();
         assert_eq!(s.verdict(1e-3), Verdict::MotionMissing);
         assert!(s.predicted.flange_m > 0.02, "{:?}", s.predicted);
         let first = &s.advice[0];
-        assert!(others.iter().any(|o| first.words.contains(o)) && !first.words.contains(have), "{first:?}");
+        assert!(others.iter().any(|o| first.instruction.contains(o)) && !first.instruction.contains(have), "{first:?}");
         assert!(s.advice.last().unwrap().after_m < 1e-3, "{:?}", s.advice);
-        let words = s.words(&world.rec, 1e-3);
-        assert!(words.contains("by 30 deg") && words.contains("motion is missing"), "{words}");
+        let text = s.to_text(&world.rec, 1e-3);
+        assert!(text.contains("by 30 deg") && text.contains("motion is missing"), "{text}");
     }
-    let world = World::new(Wish { axes: Some(&[0, 1, 2]), poses: 12, turn_deg: 30.0, seed: 77, ..Wish::default() });
+    let world =
+        World::new(WorldSpec { axes: Some(&[0, 1, 2]), poses: 12, turn_deg: 30.0, seed: 77, ..WorldSpec::default() });
     let s = world.solve();
     assert_eq!(s.verdict(1e-3), Verdict::Good, "{:?}", s.predicted);
     assert!(s.advice.is_empty());
 }
 
-/// The derivatives of the likelihood are those of its value.
+/// The analytic derivatives of the objective match finite differences.
 #[test]
-fn the_gradient_is_that_of_the_objective() {
+fn gradient_matches_finite_differences() {
     use super::bundle::{Model, POSES, Scales, State};
     use super::rig_prior::{RigDeviations, RigPrior};
-    let world = World::new(Wish { poses: 4, marks_m: 5e-4, seed: 5, ..Wish::default() });
+    let world = World::new(WorldSpec { poses: 4, marks_m: 5e-4, seed: 5, ..WorldSpec::default() });
     let model = Model::new(&world.rec, RigPrior::from_deviations(&RigDeviations::default(), &world.rec.rig), true);
     let mut d = Draw::new(3);
     let mut small = |t: f64| graspd_rt::geom::exp_twist(&nalgebra::Vector6::from_fn(|_, _| d.normal(t)));
@@ -138,7 +140,7 @@ fn the_gradient_is_that_of_the_objective() {
         flange: (0..4).map(|_| small(2e-4)).collect(),
         u: nalgebra::DVector::from_fn(model.prior.unknowns(), |i, _| 0.1 * i as f64 - 0.5),
     };
-    let k = Scales { px: 2.0, flange_m: 1e-4, flange_rad: 3e-4, marks_m: 5e-4, outliers: 0.01, foreign: 0.01 };
+    let k = Scales { px: 2.0, flange_m: 1e-4, flange_rad: 3e-4, marks_m: 5e-4, outliers: 0.01, outlier_poses: 0.01 };
     let n = model.normal(&s, &k);
     let g = model.globals();
     let value = |global: &nalgebra::DVector<f64>, local: &[nalgebra::Vector6<f64>]| {

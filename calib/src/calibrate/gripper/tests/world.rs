@@ -1,4 +1,5 @@
-//! Recordings with known truth: a verged rig 1.5 m from a gripper with eight marks, after the data sets' generator.
+//! Synthetic recordings with ground truth: a converging rig 1.5 m from a gripper with eight marks, modelled on the
+//! generator of the public data sets.
 
 use crate::calibrate::gripper::data::{ArmPose, Noise, Recording, Sighting, Sigma};
 use crate::calibrate::gripper::rig_prior::{RigChange, RigDeviations, RigPrior, moved};
@@ -9,35 +10,35 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-/// What is asked of a world.
+/// Parameters of a synthetic world.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Wish {
+pub(super) struct WorldSpec {
     pub(super) seed: u64,
     pub(super) poses: usize,
-    /// Largest turn of a pose from the one that faces the rig, degrees.
+    /// Maximum rotation of a pose from the one that faces the rig, degrees.
     pub(super) turn_deg: f64,
     pub(super) outliers: f64,
     pub(super) marks_m: f64,
-    /// The reported rig is off by draws from the default deviations.
+    /// The reported rig has errors drawn from the default standard deviations.
     pub(super) rig_off: bool,
-    /// Axes that the poses turn about, in the flange's frame; all where `None`.
+    /// Axes of the poses' rotations, in the flange's frame; any axis if `None`.
     pub(super) axes: Option<&'static [usize]>,
 }
 
-impl Default for Wish {
+impl Default for WorldSpec {
     fn default() -> Self {
         Self { seed: 1, poses: 30, turn_deg: 60.0, outliers: 0.0, marks_m: 0.0, rig_off: false, axes: None }
     }
 }
 
-/// A recording and its truth.
+/// A recording and its ground truth.
 pub(super) struct World {
     pub(super) rec: Recording,
     pub(super) x: Pose,
     pub(super) y: Pose,
     pub(super) marks: Vec<Vec3>,
     pub(super) rig: Rig,
-    /// Fresh poses for judging.
+    /// Poses that are not in the recording, for evaluation.
     pub(super) fresh: Vec<Pose>,
 }
 
@@ -86,7 +87,7 @@ fn rig(d: &mut Draw) -> Rig {
 }
 
 impl World {
-    pub(super) fn new(w: Wish) -> Self {
+    pub(super) fn new(w: WorldSpec) -> Self {
         let mut d = Draw::new(w.seed);
         let rig = rig(&mut d);
         let target = Vec3::new(0.5, 0.0, 0.35) + d.three(0.02);
@@ -121,13 +122,13 @@ impl World {
                 marks: seen,
             });
         }
-        let all = Wish { axes: None, ..w };
+        let all = WorldSpec { axes: None, ..w };
         world.fresh = (0..40).map(|_| world.flange(target, all, &mut d)).collect();
         world
     }
 
-    /// A flange pose whose marks both images show.
-    fn flange(&self, target: Vec3, w: Wish, d: &mut Draw) -> Pose {
+    /// A flange pose with all marks visible in both images.
+    fn flange(&self, target: Vec3, w: WorldSpec, d: &mut Draw) -> Pose {
         loop {
             let angle = d.uniform(5.0, w.turn_deg).to_radians();
             let sign = if d.uniform(0.0, 1.0) < 0.5 { -1.0 } else { 1.0 };
@@ -138,7 +139,7 @@ impl World {
                 None => {
                     Pose::from_parts(Translation3::from(place), facing * UnitQuaternion::from_scaled_axis(axis * angle))
                 }
-                // Turns in the flange's own axes, from the flange that faces the rig.
+                // Rotations about the flange's own axes, from the flange pose that faces the rig.
                 Some(axes) => {
                     let k = axes[(d.uniform(0.0, axes.len() as f64)) as usize % axes.len()];
                     let mut axis = Vec3::zeros();
@@ -164,7 +165,7 @@ impl World {
         self.rig.project(view, &x.coords)
     }
 
-    fn seen(&self, flange: &Pose, w: Wish, d: &mut Draw) -> Vec<Sighting> {
+    fn seen(&self, flange: &Pose, w: WorldSpec, d: &mut Draw) -> Vec<Sighting> {
         let mut out = Vec::new();
         for (mark, m) in self.marks.iter().enumerate() {
             let mut px = [None; 2];
@@ -186,7 +187,7 @@ impl World {
         calibrate(&self.rec, 1e-3).unwrap()
     }
 
-    /// Root mean square error of marks predicted at fresh poses: metres in the left camera, pixels.
+    /// Root mean square error of the marks predicted at the fresh poses: metres in the left camera, pixels.
     pub(super) fn predicted(&self, s: &Solution) -> [f64; 2] {
         let (mut m2, mut p2, mut n) = (0.0, 0.0, 0.0);
         for flange in &self.fresh {
@@ -205,7 +206,7 @@ impl World {
         [(m2 / n).sqrt(), (p2 / n).sqrt()]
     }
 
-    /// Squared error of poses and marks in the reported covariance, over its degrees of freedom.
+    /// Squared Mahalanobis error of poses and marks under the reported covariance, divided by the degrees of freedom.
     pub(super) fn normalized(&self, s: &Solution) -> f64 {
         let n = 12 + s.mark_unknowns();
         let mut e = DVector::zeros(n);
@@ -223,7 +224,7 @@ impl World {
     }
 }
 
-fn recording(rig: Rig, marks: &[Vec3], w: Wish, d: &mut Draw) -> Recording {
+fn recording(rig: Rig, marks: &[Vec3], w: WorldSpec, d: &mut Draw) -> Recording {
     let stated = |value| Sigma { value, stated: true };
     let noise = Noise {
         flange_m: stated(1e-4),
@@ -241,7 +242,7 @@ fn recording(rig: Rig, marks: &[Vec3], w: Wish, d: &mut Draw) -> Recording {
         rig
     };
     Recording {
-        name: "drawn".into(),
+        name: "synthetic".into(),
         rig: reported,
         rig_prior: None,
         marks: nominal,
