@@ -1,5 +1,5 @@
-//! The fit of marks to grey values against rendered truth: at the bound, with an honest covariance, over sizes, blurs
-//! and motions.
+//! Compares the fit of marks to grey values with rendered ground truth: error near the Cramér-Rao bound and consistent
+//! covariance for several sizes, blurs and motions.
 #![allow(clippy::unwrap_used)] // a test, bench or example
 
 mod support;
@@ -13,7 +13,7 @@ use support::*;
 
 const SIDE: usize = 200;
 
-/// What a series of marks is like.
+/// Parameters of a series of marks.
 #[derive(Clone, Copy, Debug)]
 struct Case {
     radius: f64,
@@ -21,13 +21,13 @@ struct Case {
     noise: f64,
     /// Motion during the exposure, px.
     motion: f64,
-    /// Whether the meter is told the blur, or the usual one.
+    /// Whether the meter gets the true blur or the default one.
     known: bool,
 }
 
 const PLAIN: Case = Case { radius: 10.0, blur: 0.7, noise: 2.0, motion: 0.0, known: true };
 
-/// Root mean square error of a coordinate, mean normalised squared error of a coordinate, number found.
+/// Root mean square error per coordinate (px), mean normalised squared error per coordinate, number of measured marks.
 fn series(case: Case, n: usize, seed: u64) -> (f64, f64, usize) {
     let camera = Camera { width: SIDE as u32, height: SIDE as u32, cx: 100.0, cy: 98.0, ..camera(true) };
     let mut random = Random(seed);
@@ -54,11 +54,11 @@ fn series(case: Case, n: usize, seed: u64) -> (f64, f64, usize) {
         }
         let bytes = sum.expose(&Exposure { noise: case.noise, ramp: (0.15, -0.2), ..Exposure::default() }, &mut random);
         let image = ImageView::new(&bytes, SIDE, SIDE, SIDE).unwrap();
-        // The prediction is a third of a pixel off in the image, and right in shape: what the encoders give.
+        // The prediction is off by 0.3 px in the image and has the correct shape, like a prediction from the encoders.
         let off = random.direction() * (0.3 * z / 1200.0);
         let predicted = Pose::translation(off.x, off.y, 0.0) * pose;
         let outline = marks::predict(&camera, &predicted, &mark, 0.2).unwrap();
-        let blur = if case.known { case.blur * case.blur } else { marks::USUAL_BLUR };
+        let blur = if case.known { case.blur * case.blur } else { marks::DEFAULT_BLUR_PX2 };
         let expected = Expected { search_px: 8.0, start: Vector2::zeros(), blur, motion };
         let Ok(m) = meter.measure(&image, &outline, &mark, &MarkSettings::default(), &expected) else { continue };
         let e = m.observation.pixel - camera.project(&pose.translation.vector).unwrap();
@@ -69,7 +69,7 @@ fn series(case: Case, n: usize, seed: u64) -> (f64, f64, usize) {
     }
     let n = 2.0 * found as f64;
     println!(
-        "{case:?}: {found} found, rms {:.4} px (bound {:.4}, worst {worst:.3}), normalised {:.2}",
+        "{case:?}: {found} measured, rms {:.4} px (bound {:.4}, worst {worst:.3}), normalised {:.2}",
         (squares / n).sqrt(),
         bound(&case),
         normalised / n
@@ -77,20 +77,20 @@ fn series(case: Case, n: usize, seed: u64) -> (f64, f64, usize) {
     ((squares / n).sqrt(), normalised / n, found)
 }
 
-/// The Cramer-Rao bound of a coordinate for a disc of this radius, levels known: per unit of rim the information is the
-/// integral of the squared profile of the smeared edge, and half of it is along either axis.
+/// Cramér-Rao bound per coordinate for a disc of this radius with known levels, px. The information per unit length of
+/// rim is the integral of the squared profile of the blurred edge, and half of it is along either axis.
 fn bound(case: &Case) -> f64 {
     let variance = case.blur * case.blur + 1.0 / 12.0;
     let information = 1.0 / (2.0 * (std::f64::consts::PI * variance).sqrt());
-    // The discs are tilted by up to 0.6 rad about two axes: a rim of 0.95 of a circle's on the average.
+    // The discs are tilted by up to 0.6 rad about two axes: the mean rim length is 0.95 of a circle's.
     case.noise / (155.0 * (0.95 * std::f64::consts::PI * case.radius * information).sqrt())
 }
 
 #[test]
-fn marks_of_all_sizes_and_blurs_are_measured_near_the_bound_and_say_how_near() {
+fn error_is_near_the_bound_and_covariance_is_consistent_for_all_sizes_and_blurs() {
     let mut all = Vec::new();
     for (radius, blur) in [(3.0, 0.5), (5.0, 0.7), (10.0, 0.5), (10.0, 1.0), (10.0, 2.0), (20.0, 0.7), (30.0, 1.0)] {
-        // A blur of a third of the half width that nothing is known of is not told from the shape by one mark alone.
+        // A single mark cannot separate an unknown blur of a third of its half width from its shape.
         for known in [true, false].into_iter().filter(|known| *known || 6.0 * blur < radius) {
             let case = Case { radius, blur, known, ..PLAIN };
             all.push((case, series(case, 150, 17 + radius as u64)));
@@ -98,15 +98,15 @@ fn marks_of_all_sizes_and_blurs_are_measured_near_the_bound_and_say_how_near() {
     }
     for (case, (rms, normalised, found)) in all {
         assert!(found >= 149, "{case:?}: {found}");
-        // 1.2 to 1.5 where flat pixels fix the levels; small marks and wide blurs have few of those.
-        assert!(rms < 2.3 * bound(&case), "{case:?}: {rms} against a bound of {}", bound(&case));
-        // 300 coordinates: one deviation is 0.08.
+        // 1.2 to 1.5 if flat pixels determine the levels; small marks and wide blurs have few of them.
+        assert!(rms < 2.3 * bound(&case), "{case:?}: rms {rms} px, bound {} px", bound(&case));
+        // 300 coordinates: one standard deviation is 0.08.
         assert!(normalised > 0.65 && normalised < 1.35, "{case:?}: {normalised}");
     }
 }
 
 #[test]
-fn known_motion_leaves_no_bias_and_an_honest_covariance() {
+fn known_motion_causes_no_bias_and_keeps_the_covariance_consistent() {
     for motion in [1.0, 3.0, 6.0] {
         let case = Case { motion, ..PLAIN };
         let (rms, normalised, found) = series(case, 100, 5);

@@ -1,4 +1,5 @@
-//! Tracking against rendered truth: bias and honest covariance of marks and pose, and what happens when the image lies.
+//! Compares tracking with rendered ground truth: bias and covariance of marks and pose, and the reaction to occluded,
+//! blank, frozen and invalid images.
 #![allow(clippy::unwrap_used, clippy::field_reassign_with_default)] // a test, bench or example
 
 mod support;
@@ -10,7 +11,8 @@ use graspd_rt::online::marks::{self, MarkSettings};
 use graspd_rt::online::{FrameReject, VisionCycle, VisionSettings, VisionStatus};
 use support::*;
 
-/// One disc at a random place, size and tilt; returns (error, claimed covariance) of its measured centre.
+/// Measures one disc at a random position and tilt; returns the error of its centre (x and y, px) and the normalised
+/// squared error.
 fn one_disc(
     random: &mut Random,
     radius_px: f64,
@@ -36,7 +38,7 @@ fn one_disc(
     scene.draw(&mut canvas, &rig, View::Left, &gripper, &pose, &[]);
     let bytes = canvas.expose(exposure, random);
     let image = ImageView::new(&bytes, 1280, 1024, 1280).unwrap();
-    // The prediction is off by some pixels, 1 % in depth and 1 degree.
+    // The prediction is off by several pixels, 1 % in depth and 1 degree.
     let shift = random.direction() * start_px * z / 1200.0;
     let wrong = graspd_rt::geom::Pose::translation(shift.x, shift.y, 0.01 * z) * pose * nudge(random, 0.0, 1.0);
     let outline = marks::predict(&camera, &wrong, &mark, 0.2)?;
@@ -75,17 +77,17 @@ fn many(radius: f64, scene: &Scene, exposure: &Exposure, n: usize) -> Statistic 
         z2: all.iter().map(|a| a.2).sum::<f64>() / m,
     };
     println!(
-        "radius {radius:4.1} px blur {:.1} noise {:.1}: found {}/{n} bias {:.4} sigma {:.4} worst {:.3} px, mean z2 {:.2} (2 is honest)",
+        "radius {radius:4.1} px blur {:.1} noise {:.1}: measured {}/{n} bias {:.4} sigma {:.4} worst {:.3} px, mean z2 {:.2} (consistent: 2)",
         scene.blur, exposure.noise, s.found, s.bias, s.sigma, s.worst, s.z2
     );
     s
 }
 
 #[test]
-fn centres_are_unbiased_and_their_covariance_is_honest() {
+fn centres_are_unbiased_with_consistent_covariance() {
     for (radius, limit) in [(3.0, 0.09), (5.0, 0.05), (9.0, 0.03), (16.0, 0.025), (29.0, 0.025)] {
         let s = many(radius, &Scene::default(), &Exposure::default(), 60);
-        assert!(s.found >= if radius < 4.0 { 50 } else { 58 }, "radius {radius}: only {} found", s.found);
+        assert!(s.found >= if radius < 4.0 { 50 } else { 58 }, "radius {radius}: only {} measured", s.found);
         assert!(s.bias < 0.02, "radius {radius}: bias {}", s.bias);
         assert!(s.sigma < limit, "radius {radius}: sigma {}", s.sigma);
         assert!(s.z2 > 0.3 && s.z2 < 6.0, "radius {radius}: mean z2 {}", s.z2);
@@ -93,7 +95,7 @@ fn centres_are_unbiased_and_their_covariance_is_honest() {
 }
 
 #[test]
-fn without_noise_what_is_left_is_method() {
+fn method_error_without_noise_is_small() {
     let clean = Exposure { noise: 0.0, ..Default::default() };
     for radius in [4.0, 9.0, 20.0] {
         let s = many(radius, &Scene::default(), &clean, 40);
@@ -102,7 +104,7 @@ fn without_noise_what_is_left_is_method() {
 }
 
 #[test]
-fn light_gain_and_blur_do_not_move_centres() {
+fn illumination_gain_and_blur_do_not_shift_centres() {
     for (gain, offset, blur) in [(0.35, 0.0, 0.7), (1.15, 5.0, 0.7), (0.5, 90.0, 0.7), (1.0, 0.0, 1.6), (1.0, 0.0, 2.2)]
     {
         let exposure = Exposure { gain, offset, ramp: (0.5, -0.4), noise: 2.0 };
@@ -112,7 +114,7 @@ fn light_gain_and_blur_do_not_move_centres() {
 }
 
 #[test]
-fn pose_is_as_good_as_promised_and_says_how_good() {
+fn pose_meets_its_accuracy_limits_with_consistent_covariance() {
     let (rig, gripper) = (rig(true), gripper());
     let mut random = Random(11);
     let (mut lateral, mut depth, mut turn, mut z2, mut n) = (0.0, 0.0, 0.0, 0.0, 0.0);
@@ -134,13 +136,13 @@ fn pose_is_as_good_as_promised_and_says_how_good() {
     let (lateral, depth, turn, z2): (f64, f64, f64, f64) =
         ((lateral / n / 2.0).sqrt() * 1e3, (depth / n).sqrt() * 1e3, (turn / n / 3.0).sqrt().to_degrees(), z2 / n);
     println!(
-        "pose sigma: lateral {lateral:.4} mm, depth {depth:.4} mm, turn {turn:.4} deg per axis, mean z2 {z2:.2} (6 is honest)"
+        "pose sigma: lateral {lateral:.4} mm, depth {depth:.4} mm, turn {turn:.4} deg per axis, mean z2 {z2:.2} (consistent: 6)"
     );
     assert!(lateral < 0.05 && depth < 0.15 && turn < 0.05);
     assert!(z2 > 1.5 && z2 < 18.0);
 }
 
-/// A cycle that tracks a still gripper, its truth and the pair it saw.
+/// A cycle that tracks a gripper at rest, the ground truth of its pose, and the random generator.
 fn tracking(seed: u64) -> (VisionCycle, graspd_rt::geom::Pose, Random) {
     let (rig, gripper) = (rig(true), gripper());
     let mut random = Random(seed);
@@ -159,7 +161,7 @@ fn distance_mm(a: &graspd_rt::geom::Pose, b: &graspd_rt::geom::Pose) -> f64 {
 }
 
 #[test]
-fn a_moving_gripper_is_followed_without_a_prior() {
+fn a_moving_gripper_is_tracked_without_a_prior() {
     let (mut cycle, mut truth, mut random) = tracking(3);
     let step = nudge(&mut random, 3.0, 0.6);
     for k in 3..15 {
@@ -180,7 +182,7 @@ fn a_moving_gripper_is_followed_without_a_prior() {
 }
 
 #[test]
-fn a_finger_before_some_marks_degrades_and_does_not_pull() {
+fn occlusion_of_some_marks_degrades_the_status_and_does_not_bias_the_pose() {
     for level in [35.0, 120.0, 200.0] {
         let (mut cycle, truth, mut random) = tracking(4);
         let c = cycle.rig().project(View::Left, &truth.translation.vector).unwrap();
@@ -205,10 +207,10 @@ fn a_finger_before_some_marks_degrades_and_does_not_pull() {
 }
 
 #[test]
-fn half_hidden_marks_are_measured_on_the_rim_that_shows_or_not_at_all() {
+fn partly_occluded_marks_are_measured_on_the_visible_rim_or_rejected() {
     let (mut cycle, truth, mut random) = tracking(5);
     let (rig, gripper) = (*cycle.rig(), cycle.gripper().clone());
-    // A strip over the upper 30 % of every disc of the left view, as dark as the dark marks.
+    // A strip covers the upper 30 % of every disc of the left view, as dark as the dark marks.
     let pair =
         render(&rig, &gripper, &truth, &Scene::default(), &Exposure::default(), &mut random, &mut |view, canvas| {
             if view == View::Left {
@@ -223,7 +225,7 @@ fn half_hidden_marks_are_measured_on_the_rim_that_shows_or_not_at_all() {
     for (m, seen) in gripper.marks.iter().zip(&v.marks[0]) {
         let c = rig.project(View::Left, &(truth * nalgebra::Point3::from(m.position)).coords).unwrap();
         if let Some(s) = seen {
-            assert!((s.pixel - c).norm() < 0.25, "off by {} px", (s.pixel - c).norm());
+            assert!((s.pixel - c).norm() < 0.25, "error {} px", (s.pixel - c).norm());
         }
     }
     assert!(distance_mm(&v.left_from_gripper, &truth) < 0.3);
@@ -254,7 +256,7 @@ fn one_mark_shifted_in_one_view_is_dropped() {
 }
 
 #[test]
-fn one_view_is_enough_for_a_degraded_pose() {
+fn one_view_gives_a_degraded_pose() {
     let (mut cycle, truth, mut random) = tracking(7);
     let mut pair = render(
         cycle.rig(),
@@ -274,7 +276,7 @@ fn one_view_is_enough_for_a_degraded_pose() {
 }
 
 #[test]
-fn blank_frames_lose_the_marks_and_coasting_finds_them_again() {
+fn blank_frames_lose_the_marks_and_coasting_recovers_them() {
     let (mut cycle, truth, mut random) = tracking(8);
     let pair = render(
         cycle.rig(),
@@ -300,9 +302,9 @@ fn blank_frames_lose_the_marks_and_coasting_finds_them_again() {
 }
 
 #[test]
-fn a_leap_is_refused_and_then_given_up() {
+fn a_jump_is_rejected_and_then_the_track_is_dropped() {
     let (mut cycle, truth, mut random) = tracking(9);
-    // 12 mm in 16 ms is 0.75 m/s: believable. With a limit of 0.1 m/s it is not.
+    // 12 mm in 16 ms is 0.75 m/s: plausible with the default limit, implausible with a limit of 0.1 m/s.
     let settings = VisionSettings { max_speed: 0.1, ..VisionSettings::default() };
     let mut slow = VisionCycle::new(*cycle.rig(), cycle.gripper().clone(), settings);
     let still = render(
@@ -315,7 +317,7 @@ fn a_leap_is_refused_and_then_given_up() {
         &mut |_, _| {},
     );
     let moved = truth * graspd_rt::geom::Pose::translation(0.012, 0.0, 0.0);
-    let leap = render(
+    let jump = render(
         cycle.rig(),
         cycle.gripper(),
         &moved,
@@ -324,18 +326,18 @@ fn a_leap_is_refused_and_then_given_up() {
         &mut random,
         &mut |_, _| {},
     );
-    assert_eq!(cycle.step(&leap.frame(3), None).unwrap().status, VisionStatus::Tracking);
+    assert_eq!(cycle.step(&jump.frame(3), None).unwrap().status, VisionStatus::Tracking);
     slow.seed(truth);
     assert_eq!(slow.step(&still.frame(1), None).unwrap().status, VisionStatus::Tracking);
     for k in 2..5 {
-        assert!(matches!(slow.step(&leap.frame(k), None), Err(FrameReject::Jump { .. })), "frame {k}");
+        assert!(matches!(slow.step(&jump.frame(k), None), Err(FrameReject::Jump { .. })), "frame {k}");
     }
     assert_eq!(slow.faults().jump, 3);
     assert!(slow.needs_acquisition());
 }
 
 #[test]
-fn frames_that_lie_are_refused_by_name_and_counted() {
+fn invalid_frames_are_rejected_with_their_reason_and_counted() {
     let (mut cycle, truth, mut random) = tracking(10);
     let pair = render(
         cycle.rig(),
@@ -371,7 +373,7 @@ fn frames_that_lie_are_refused_by_name_and_counted() {
 }
 
 #[test]
-fn a_frozen_image_is_seen_although_the_prediction_moves() {
+fn a_frozen_image_is_detected_while_the_prediction_moves() {
     let (mut cycle, truth, mut random) = tracking(12);
     let pair = render(
         cycle.rig(),

@@ -2,7 +2,7 @@
 
 use super::io::LinkStatus;
 use super::settings::WatchSettings;
-use crate::arm::{Joints, RobotState, ToolPoint};
+use crate::arm::{Joints, ROBOT_MODE_RUNNING, RobotState, ToolPoint};
 use crate::math;
 use crate::mode::FaultCause;
 
@@ -10,8 +10,6 @@ use crate::mode::FaultCause;
 const SENT: usize = 64;
 /// Longest delay between a set-point and the motion, ns.
 const DELAY_NS: u64 = 60_000_000;
-/// `robot_mode` of a robot that is powered, with released brakes.
-const ROBOT_MODE_RUNNING: i32 = 7;
 /// `runtime_state` of a program that runs.
 const RUNTIME_STATE_PLAYING: u32 = 2;
 /// Largest plausible joint position, rad.

@@ -7,7 +7,7 @@ use crate::mode::{FaultCause, HoldCause};
 use crate::online::predict::JointHistory;
 use crate::online::rig_watch::RigHealth;
 use crate::online::screw::{LawSettings, ViewMode};
-use crate::online::{Vision, VisionStatus};
+use crate::online::{Vision, VisionStatus, mid_exposure_ns};
 
 /// Images over which the motion of images and joints is compared.
 const WINDOW: usize = 6;
@@ -39,12 +39,8 @@ pub(super) struct Seen {
 
 impl Seen {
     pub(super) fn capture_ns(&self) -> u64 {
-        middle(&self.vision.capture_ns)
+        mid_exposure_ns(self.vision.capture_ns)
     }
-}
-
-fn middle(c: &[u64; 2]) -> u64 {
-    c[0] / 2 + c[1] / 2 + (c[0] & c[1] & 1)
 }
 
 /// What is known of the images.
@@ -126,7 +122,7 @@ impl VisionWatch {
     fn judge(&mut self, now: u64, v: &Vision, history: &JointHistory, dh: &Dh, mount: &Pose, driven: bool) -> Taken {
         let (early, late) = (v.capture_ns[0].min(v.capture_ns[1]), v.capture_ns[0].max(v.capture_ns[1]));
         let last = self.seen.map_or(0, |s| s.capture_ns());
-        let capture = middle(&v.capture_ns);
+        let capture = mid_exposure_ns(v.capture_ns);
         if late > now + MAX_AHEAD_NS || now.saturating_sub(early) > MAX_AGE_NS || (driven && capture <= last) {
             self.bad_stamps += 1;
             return Taken::Refused;

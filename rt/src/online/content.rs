@@ -8,10 +8,10 @@ use crate::image::ImageView;
 
 /// Detects an image that repeats byte by byte while its sequence number advances.
 ///
-/// A few rows about each mark are hashed, at the marks' positions *when the content last changed*: with windows that
-/// follow the prediction, a moving arm would make a frozen image look new. The noise of a live camera changes the hash
-/// in every frame, so a run of equal hashes is a frozen image. Whether that is a fault (the arm moves) is decided by
-/// the caller.
+/// A few rows around each mark are hashed, at the marks' positions *when the content last changed*: windows that follow
+/// the prediction would move with the arm, and a frozen image would seem to change. The noise of a live camera changes
+/// the hash in every frame, so a run of equal hashes is a frozen image. The caller decides whether that is a fault (the
+/// arm moves).
 #[derive(Clone, Debug)]
 pub(crate) struct FreezeWatch {
     anchors: [[Option<(u16, u16)>; MAX_MARKS]; 2],
@@ -34,7 +34,7 @@ impl FreezeWatch {
         self.run
     }
 
-    /// Takes a frame and the marks measured in it.
+    /// Updates the run with a frame and the marks measured in it.
     pub(crate) fn update(&mut self, frame: &StereoFrame<'_>, marks: &MarkTable) {
         let anchored = self.anchors.iter().flatten().any(Option::is_some);
         if anchored && self.digest(frame) == self.hash {
@@ -51,7 +51,7 @@ impl FreezeWatch {
     }
 
     fn digest(&self, frame: &StereoFrame<'_>) -> u64 {
-        // FNV-1a over words of eight pixels: a byte at a time it would cost as much as the pose.
+        // FNV-1a over groups of eight pixels: byte by byte, it would take as long as the pose.
         let mut h = 0xcbf2_9ce4_8422_2325_u64;
         for view in View::BOTH {
             let image = frame.image(view);
@@ -90,6 +90,6 @@ pub(crate) fn badly_exposed(image: &ImageView<'_>, min_contrast: f64) -> bool {
         }
     }
     let all = (SIDE * SIDE) as u32;
-    // A dark background is no fault, so nearly all pixels must be black; half of them saturated is a fault.
+    // A dark background is not a fault, so 95 % of the pixels have to be black. Half of them saturated is a fault.
     black * 20 > all * 19 || white * 2 > all || f64::from(high.saturating_sub(low)) < min_contrast
 }

@@ -1,8 +1,9 @@
-//! Gripper pose from the marks of both views, or of one: robust weighted reprojection error, a fixed number of steps.
+//! Estimates the gripper pose from the marks of one or both views: minimises the robust weighted reprojection error in
+//! a bounded number of steps.
 //!
-//! The unknown is a small gripper-frame screw `xi = [v; ω]`, `left_from_gripper <- left_from_gripper * exp(xi)`; in
-//! that frame the derivative of a mark's position is the same whatever the pose, and the covariance is what the command
-//! side wants.
+//! The unknown is a small gripper-frame screw `xi = [v; ω]`, `left_from_gripper <- left_from_gripper * exp(xi)`. In
+//! this frame the derivative of a mark's position does not depend on the pose, and the covariance is in the form that
+//! the command side uses.
 
 use super::MarkObservation;
 use crate::geom::{Pixel, Pose, Rig, Twist, Vec3, View, exp_twist};
@@ -13,16 +14,16 @@ use nalgebra::{Matrix2, Matrix2x6, Matrix3, Matrix3x6, Matrix6, Point3, Vector2,
 /// Marks by view and mark index, as [`super::Vision`] carries them.
 pub type MarkTable = [[Option<MarkObservation>; MAX_MARKS]; 2];
 
-/// How the pose is estimated.
+/// Settings of the pose estimate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PoseSettings {
     /// Gauss-Newton steps of the robust stage. Default 10.
     pub steps: u32,
-    /// A mark farther from its prediction than this many of its sigmas (of the marks' own spread, if that is larger) is
-    /// dropped. Default 5.
+    /// Outlier gate: maximum distance of a mark from its prediction, in its standard deviations (scaled by the spread
+    /// of all marks, if that is larger). Default 5.
     pub gate_sigmas: f64,
-    /// A mark within this distance of its prediction is never dropped, pixels: a rig whose calibration is slightly
-    /// wrong moves all marks of a view, and none of them is at fault. Default 0.5.
+    /// A mark within this distance of its prediction is never dropped, pixels: a small calibration error of the rig
+    /// moves all marks of a view, and none of them is an outlier. Default 0.5.
     pub gate_floor_px: f64,
 }
 
@@ -35,24 +36,25 @@ impl Default for PoseSettings {
 /// Why there is no pose.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PoseError {
-    /// Fewer marks than determine a pose: three in stereo (two of them in both views), four in one view.
+    /// Too few marks to determine a pose. Minimum: three in stereo (two of them in both views), four in one view.
     TooFew,
-    /// The marks do not determine all six degrees of freedom: on a line, or too near to each other.
+    /// The marks do not determine all six degrees of freedom: collinear, or too close to each other.
     Degenerate,
-    /// The iteration ran behind a camera or out of the numbers.
+    /// The iteration moved a mark behind a camera, or a value is not finite.
     Diverged,
 }
 
-/// A pose and what supports it.
+/// A pose with its covariance and the observations in use.
 #[derive(Clone, Copy, Debug)]
 pub struct PoseEstimate {
     /// Gripper pose in the rig.
     pub left_from_gripper: Pose,
-    /// Covariance as a small gripper-frame screw (m, rad), scaled up when the marks disagree by more than they claim.
+    /// Covariance as a small gripper-frame screw (m, rad), scaled up if the residuals exceed the
+    /// covariances of the marks.
     pub covariance: Matrix6<f64>,
-    /// Weighted root mean square of the used marks' reprojection error, pixels.
+    /// Weighted root mean square reprojection error of the used marks, pixels.
     pub residual_px: f64,
-    /// Which observations were used; the others were absent or dropped as outliers.
+    /// The observations in use, by view and mark; the others were missing or dropped as outliers.
     pub used: [[bool; MAX_MARKS]; 2],
 }
 
@@ -69,7 +71,7 @@ impl PoseEstimate {
     }
 }
 
-/// Removes observations that the estimate threw out; says how many.
+/// Removes the observations that the estimate rejected; returns their number.
 pub(crate) fn keep_used(table: &mut MarkTable, e: &PoseEstimate) -> u64 {
     let mut dropped = 0;
     for (marks, used) in table.iter_mut().zip(&e.used) {
@@ -95,8 +97,8 @@ struct Observation {
 
 type Observations = heapless::Vec<Observation, { 2 * MAX_MARKS }>;
 
-/// One observation's error (measured minus predicted, pixels) and the derivative of its prediction by the gripper-frame
-/// screw.
+/// Error of one observation (measured minus predicted, pixels) and the derivative of its prediction with respect to the
+/// gripper-frame screw. `None` if the mark is behind the camera or the error is not finite.
 fn linearize(rig: &Rig, pose: &Pose, o: &Observation) -> Option<(Vector2<f64>, Matrix2x6<f64>)> {
     let view_from_gripper = rig.view_from_left(o.view) * pose;
     let x = (view_from_gripper * Point3::from(o.point)).coords;
@@ -115,11 +117,12 @@ fn linearize(rig: &Rig, pose: &Pose, o: &Observation) -> Option<(Vector2<f64>, M
 
 /// Estimates the pose from `marks`, starting at `start` (within some tens of pixels and degrees of the truth).
 ///
-/// From a good prediction, with marks that agree, three plain Gauss-Newton steps do ([`track`]); else the robust stage.
-/// Work is bounded: `settings.steps` robust steps, three plain ones, at most `2 * MAX_MARKS` observations each.
+/// With a good prediction and consistent marks, at most three plain Gauss-Newton steps are enough ([`track`]).
+/// Otherwise the robust stage runs. The work is bounded: at most 30 robust steps (`settings.steps`), three plain steps
+/// before and three after them, and `2 * MAX_MARKS` observations per step.
 ///
 /// # Errors
-/// [`PoseError`] when the marks do not determine a pose; a result is always finite.
+/// [`PoseError`] if the marks do not determine a pose. A result is always finite.
 pub fn estimate(
     rig: &Rig,
     gripper: &Gripper,
@@ -140,7 +143,8 @@ pub fn estimate(
             break;
         }
     }
-    // Hard decision on outliers, then plain weighted least squares on what is left, which the covariance describes.
+    // Reject outliers, then plain weighted least squares on the remaining marks: the covariance describes this
+    // estimate.
     let scale = spread(rig, &pose, &all)?;
     let mut kept = Observations::new();
     for o in &all {
@@ -159,13 +163,13 @@ pub fn estimate(
     finish(rig, pose, &kept)
 }
 
-/// Plain steps that are tried before the robust stage.
-const PLAIN_STEPS: usize = 3;
-/// A plain step shorter than this is the last one, metres and radians: it changes no pixel by 1e-3.
-const LAST_STEP: (f64, f64) = (1e-6, 1e-6);
+/// Maximum number of plain steps before the robust stage.
+const MAX_PLAIN_STEPS: usize = 3;
+/// Length of a plain step below which the iteration has converged, m and rad: it changes no pixel by 1e-3.
+const CONVERGED_STEP: (f64, f64) = (1e-6, 1e-6);
 
-/// One view as the plain steps need it.
-struct Placed {
+/// Pose of the gripper in one view, precomputed for the plain steps.
+struct ViewPose {
     /// Rotation of the view from the gripper, row by row.
     r: Matrix3<f64>,
     t: Vec3,
@@ -177,18 +181,18 @@ struct Sums {
     g: Vector6<f64>,
     /// Weighted sum of squared errors.
     chi2: f64,
-    /// The same with each observation's mean weight, and the sum of those.
+    /// Sum of squared errors with the mean weight of each observation, and the sum of these weights.
     squares: f64,
     weights: f64,
-    /// Longest error, px².
-    longest2: f64,
+    /// Maximum squared error, px².
+    max_error2: f64,
 }
 
-/// Plain weighted Gauss-Newton from a prediction: the pose, if it converges at once and no mark is near the outlier
-/// gate.
+/// Plain weighted Gauss-Newton from a prediction. `None` if it does not converge within [`MAX_PLAIN_STEPS`] or if the
+/// error of a mark exceeds the floor of the outlier gate.
 fn track(rig: &Rig, all: &Observations, start: &Pose, settings: &PoseSettings) -> Option<PoseEstimate> {
     let mut pose = *start;
-    for _ in 0..PLAIN_STEPS {
+    for _ in 0..MAX_PLAIN_STEPS {
         let s = sums(rig, &pose, all)?;
         let covariance = inverse(&s.h)?;
         let xi: Twist = covariance * s.g;
@@ -198,14 +202,14 @@ fn track(rig: &Rig, all: &Observations, start: &Pose, settings: &PoseSettings) -
             return None;
         }
         pose *= exp_twist(&xi);
-        if v2 > math::sq(LAST_STEP.0) || w2 > math::sq(LAST_STEP.1) {
+        if v2 > math::sq(CONVERGED_STEP.0) || w2 > math::sq(CONVERGED_STEP.1) {
             continue;
         }
-        if s.longest2 > math::sq(settings.gate_floor_px) {
+        if s.max_error2 > math::sq(settings.gate_floor_px) {
             return None;
         }
         pose.rotation.renormalize();
-        // The last step takes g.xi from the squares.
+        // The last step reduces the sum of squares by g·xi.
         let chi2 = (s.chi2 - s.g.dot(&xi)).max(0.0);
         let freedom = 2.0 * all.len() as f64 - 6.0;
         let factor = if freedom > 0.5 { (chi2 / freedom).max(1.0) } else { 1.0 };
@@ -228,21 +232,21 @@ fn track(rig: &Rig, all: &Observations, start: &Pose, settings: &PoseSettings) -
     None
 }
 
-/// Normal equations and errors at a pose: [`linearize`] with everything that the observations of a view share worked
-/// out once.
+/// Normal equations and errors at a pose: like [`linearize`], with the terms common to a view computed once.
 fn sums(rig: &Rig, pose: &Pose, all: &Observations) -> Option<Sums> {
-    let placed = View::BOTH.map(|view| {
+    let view_poses = View::BOTH.map(|view| {
         let p = rig.view_from_left(view) * pose;
-        Placed { r: *p.rotation.to_rotation_matrix().matrix(), t: p.translation.vector }
+        ViewPose { r: *p.rotation.to_rotation_matrix().matrix(), t: p.translation.vector }
     });
-    let mut s = Sums { h: Matrix6::zeros(), g: Vector6::zeros(), chi2: 0.0, squares: 0.0, weights: 0.0, longest2: 0.0 };
+    let mut s =
+        Sums { h: Matrix6::zeros(), g: Vector6::zeros(), chi2: 0.0, squares: 0.0, weights: 0.0, max_error2: 0.0 };
     for o in all {
-        let Placed { r, t } = &placed[o.view.index()];
+        let ViewPose { r, t } = &view_poses[o.view.index()];
         let m = &o.point;
         let (p, jx) = rig.camera(o.view).project_with_jacobian(&(r * m + t))?;
         let e = o.pixel - p;
         let j = jx * r;
-        // d(point)/d(xi) = [I, -[m]x]: a row a of the derivative by the point goes on with m x a.
+        // d(point)/d(xi) = [I, -[m]x]: a row a of the derivative with respect to the point continues with m x a.
         let row = |k: usize| {
             let a = [j[(k, 0)], j[(k, 1)], j[(k, 2)]];
             [a[0], a[1], a[2], m.y * a[2] - m.z * a[1], m.z * a[0] - m.x * a[2], m.x * a[1] - m.y * a[0]]
@@ -261,7 +265,7 @@ fn sums(rig: &Rig, pose: &Pose, all: &Observations) -> Option<Sums> {
         s.chi2 += e.x * ex + e.y * ey;
         s.squares += w * e2;
         s.weights += w;
-        s.longest2 = s.longest2.max(e2);
+        s.max_error2 = s.max_error2.max(e2);
     }
     for i in 0..6 {
         for k in 0..i {
@@ -302,7 +306,7 @@ fn enough(all: &Observations) -> Result<(), PoseError> {
     }
 }
 
-/// Whitened length of an error: about 1.2 on the median for an honest covariance.
+/// Whitened length of an error: its median is about 1.2 for a consistent covariance.
 fn whitened(o: &Observation, e: &Vector2<f64>) -> f64 {
     math::sqrt((e.transpose() * o.information * e)[0].max(0.0))
 }
@@ -324,7 +328,7 @@ fn outlying(o: &Observation, e: &Vector2<f64>, scale: f64, settings: &PoseSettin
     whitened(o, e) > settings.gate_sigmas * scale && e.norm_squared() > floor * floor
 }
 
-/// Weights for the next step: Huber while the pose is still on its way, Tukey when it is nearly there.
+/// Weights for the next step: Huber in the early steps, Tukey (`late`) near convergence.
 fn reweight(
     rig: &Rig,
     pose: &Pose,
@@ -338,7 +342,7 @@ fn reweight(
         let z = whitened(o, &e) / scale;
         o.weight = if late {
             let u = 1.0 - math::sq(z / settings.gate_sigmas);
-            // A mark that the gate would keep keeps a say, else a slightly wrong rig could starve the solution.
+            // Marks inside the gate keep a minimum weight, otherwise a small error of the rig could remove all of them.
             if outlying(o, &e, scale, settings) { 1e-6 } else { math::sq(u.max(0.1)) }
         } else if z <= 1.5 {
             1.0
@@ -361,7 +365,7 @@ fn normal_equations(rig: &Rig, pose: &Pose, all: &Observations) -> Result<(Matri
     Ok((h, g))
 }
 
-/// Inverse of a positive definite matrix, `None` when a pivot has lost ten digits or more against its diagonal.
+/// Inverse of a positive definite matrix; `None` if a pivot is at most 1e-10 of its diagonal element.
 fn inverse(h: &Matrix6<f64>) -> Option<Matrix6<f64>> {
     let l = h.cholesky()?;
     for i in 0..6 {
@@ -374,7 +378,7 @@ fn inverse(h: &Matrix6<f64>) -> Option<Matrix6<f64>> {
     inv.iter().all(|v| v.is_finite()).then_some(inv)
 }
 
-/// One damped step, limited in length; true when it was so short that the iteration has ended.
+/// One damped step, limited in length; true if it is so short that the iteration has converged.
 fn advance(pose: &mut Pose, h: &Matrix6<f64>, g: &Vector6<f64>) -> Result<bool, PoseError> {
     let mut damped = *h;
     for i in 0..6 {

@@ -1,9 +1,10 @@
-//! One frame after another into gripper poses: predict, measure, solve, look again where it paid, judge.
+//! Tracks the gripper pose from frame to frame: predict, measure, solve, measure the missing marks again, check.
 //!
-//! The cycle owns everything that is remembered between frames. It never searches the whole image: when the marks
-//! are lost it says so, and an acquisition (see [`super::acquire`]) done elsewhere hands its pose to
+//! The cycle owns all state between frames. It never searches the entire image: if the marks are lost, it reports
+//! [`VisionStatus::Lost`]. The caller then runs an acquisition (see [`super::acquire`]) and passes its pose to
 //! [`VisionCycle::seed`].
 
+use super::arm_motion::mid_exposure_ns;
 use super::content::{FreezeWatch, badly_exposed};
 use super::frame::{self, FrameFaults, FrameLimits, FrameReject, LastFrame, StereoFrame};
 use super::marks::{self, Expected, MarkMeter, MarkSettings};
@@ -16,36 +17,37 @@ use crate::gripper::{Gripper, MAX_MARKS};
 use crate::math;
 use nalgebra::{Matrix6, Vector2};
 
-/// How frames are tracked and judged.
+/// Settings of the tracker.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VisionSettings {
-    /// What a mark has to look like.
+    /// Limits on the image of a mark.
     pub marks: MarkSettings,
-    /// How the pose is solved.
+    /// Settings of the pose estimate.
     pub pose: PoseSettings,
-    /// What a pair's stamps may be.
+    /// Limits on the stamps of a pair.
     pub frame: FrameLimits,
-    /// Fastest motion of the gripper's origin that is believed, m/s. Default 1.0, four times the usual Cartesian cap.
+    /// Maximum plausible speed of the gripper's origin, m/s. Default 1.0, four times the usual Cartesian limit.
     pub max_speed: f64,
-    /// Fastest turn that is believed, rad/s. Default 4.
+    /// Maximum plausible angular speed of the gripper, rad/s. Default 4.
     pub max_turn: f64,
-    /// Distance always allowed between two poses, metres: noise of a poorly seen gripper. Default 0.004.
+    /// Distance between two poses that is always allowed, metres: noise of a pose from few marks. Default 0.004.
     pub jump_margin: f64,
-    /// Largest standard deviation of the gripper's position along any axis, metres; above it the marks count as lost.
+    /// Maximum standard deviation of the gripper's position along any axis, metres; above it the marks count as lost.
     /// Default 0.005.
     pub max_sigma: f64,
-    /// Largest residual of the used marks that the rig's own error does not explain, pixels; above it this is not the
-    /// gripper. Default 3.
+    /// Maximum residual of the used marks that the rig's error does not explain, pixels; above it the marks are not
+    /// those of the gripper. Default 3.
     pub max_residual_px: f64,
-    /// The rig's stated error, and when it counts as changed.
+    /// Stated error of the rig, and the limits above which the rig counts as changed.
     pub rig: RigWatchSettings,
-    /// How long the cameras expose, seconds: marks are smeared along their predicted motion. Default 0, which takes
-    /// images for sharp; a smear of less than half a pixel makes no difference.
+    /// Exposure time of the cameras, seconds. The mark model includes the predicted motion during this time. Default 0:
+    /// no motion blur. A motion of less than half a pixel has no effect.
     pub exposure_s: f64,
-    /// Fewest different marks that make a pose worth having: three determine one, but then nothing says that one of
-    /// them is wrong. Default 4.
+    /// Minimum number of different marks for a usable pose: three determine a pose, but then an outlier among them
+    /// cannot be detected. Default 4.
     pub min_marks: usize,
-    /// Frames over which lost marks are looked for at the prediction before an acquisition is needed. Default 5.
+    /// Number of frames in which lost marks are searched near the prediction before an acquisition is needed. Default
+    /// 5.
     pub coast_frames: u32,
 }
 
@@ -68,62 +70,62 @@ impl Default for VisionSettings {
     }
 }
 
-/// Parts of a step, in order; after the last comes the judgement.
+/// Stages of a step, in order; the final checks follow the last stage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StepStage {
     /// Stamps, sizes, exposure.
     Check,
     /// Prediction and measurement of the marks.
     Marks,
-    /// Pose, second look, and how well the rig explains the marks.
+    /// Pose, second measurement of missing marks, and the residual that the rig does not explain.
     Pose,
-    /// Frozen images, and whether a camera was moved.
+    /// Checks for frozen images and for a displaced camera.
     Watch,
 }
 
-/// What the last frame said about the cameras, beside the pose.
+/// State of the cameras by the last frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct VisionHealth {
-    /// Frames in a row whose mark windows were byte for byte those of the frame before: a frozen image, if the arm
-    /// moves \[C03\].
+    /// Number of consecutive frames whose mark windows are byte for byte those of the frame before: a frozen image, if
+    /// the arm moves.
     pub frozen_run: u32,
-    /// Whether each view is black, saturated or without contrast \[C12\].
+    /// Whether each view is black, saturated or without contrast.
     pub badly_exposed: [bool; 2],
-    /// Marks predicted to be visible in each view.
+    /// Number of marks predicted to be visible in each view.
     pub expected: [u8; 2],
-    /// Mean over the marks seen in both views of (measured - predicted) row coordinate, left minus right, pixels:
-    /// away from its usual value when a camera was knocked \[C14\]. Zero when no mark was seen in both.
+    /// Mean over the marks seen in both views of (measured - predicted) row coordinate, left minus right, pixels. It
+    /// changes if a camera is displaced. Zero if no mark was seen in both views.
     pub vertical_disparity_px: f64,
 }
 
-/// Turn between prediction and solution above which marks are predicted anew, rad.
-const REMEASURE_TURN: f64 = 0.01;
+/// Rotation between prediction and solution above which all marks are measured again, rad.
+const REMEASURE_TURN_RAD: f64 = 0.01;
 
 #[derive(Clone, Copy, Debug)]
 struct Track {
     pose: Pose,
-    /// Gripper in the robot's base by the encoders at `at_ns`.
+    /// Gripper in the robot's base at `at_ns`, from the encoders.
     base_from_gripper: Option<Pose>,
-    /// Gripper-frame velocity, used when there is no prediction from the joints.
+    /// Gripper-frame velocity, used without a prediction from the joints.
     velocity: Twist,
-    /// Capture time of `pose`; `None` straight after a seed.
+    /// Capture time of `pose`; `None` directly after a seed.
     at_ns: Option<u64>,
     misses: u32,
 }
 
-/// Blur of one view's lens as its marks show it.
+/// Blur of one view's lens, estimated from its marks.
 #[derive(Clone, Copy, Debug)]
 struct LensBlur {
-    /// Mean of the last marks that were asked for it, px².
+    /// Mean over the last marks that estimated it, px².
     variance: f64,
     marks: u32,
 }
 
-/// Marks over which the blur is averaged.
+/// Number of marks over which the blur is averaged.
 const BLUR_MARKS: u32 = 16;
 
 impl LensBlur {
-    const UNKNOWN: Self = Self { variance: marks::USUAL_BLUR, marks: 0 };
+    const UNKNOWN: Self = Self { variance: marks::DEFAULT_BLUR_PX2, marks: 0 };
 
     fn learn(&mut self, variance: f64) {
         self.marks = (self.marks + 1).min(BLUR_MARKS);
@@ -131,7 +133,7 @@ impl LensBlur {
     }
 }
 
-/// The tracker: rig, gripper, settings, and what it remembers.
+/// The tracker: rig, gripper, settings, and the state between frames.
 #[derive(Clone, Debug)]
 pub struct VisionCycle {
     rig: Rig,
@@ -147,12 +149,12 @@ pub struct VisionCycle {
     blur: [LensBlur; 2],
 }
 
-/// A pose, whether it is sound, and what of its residual the rig's error does not explain.
+/// A pose, whether it is usable, and the part of its residual that the rig's error does not explain.
 struct Solved {
     estimate: PoseEstimate,
-    sound: bool,
+    usable: bool,
     inner_residual_px: f64,
-    /// What was measured, marks that the pose threw out included.
+    /// The measured marks, including those that the pose rejected.
     seen: MarkTable,
 }
 
@@ -174,8 +176,8 @@ impl VisionCycle {
         }
     }
 
-    /// Takes over an acquired pose (`left_from_gripper`); the next frame is searched about it. A pose that is not
-    /// finite is ignored.
+    /// Starts a track at an acquired pose (`left_from_gripper`); the next frame is searched around it. A pose that is
+    /// not finite is ignored.
     pub fn seed(&mut self, pose: Pose) {
         if pose.translation.vector.iter().chain(pose.rotation.coords.iter()).all(|v| v.is_finite()) {
             let track = Track { pose, base_from_gripper: None, velocity: Twist::zeros(), at_ns: None, misses: 0 };
@@ -183,32 +185,32 @@ impl VisionCycle {
         }
     }
 
-    /// Whether the marks have to be acquired (see [`VisionCycle::seed`]) before tracking can go on.
+    /// Whether the marks have to be acquired (see [`VisionCycle::seed`]) before tracking can continue.
     pub fn needs_acquisition(&self) -> bool {
         self.track.is_none()
     }
 
-    /// Counts of refused and troubled frames.
+    /// Counts of rejected and degraded frames.
     pub fn faults(&self) -> FrameFaults {
         self.faults
     }
 
-    /// What the last frame said about the cameras.
+    /// State of the cameras by the last frame.
     pub fn health(&self) -> VisionHealth {
         self.health
     }
 
-    /// The rig that this tracker believes in.
+    /// The rig in use.
     pub fn rig(&self) -> &Rig {
         &self.rig
     }
 
-    /// The gripper that this tracker looks for.
+    /// The tracked gripper.
     pub fn gripper(&self) -> &Gripper {
         &self.gripper
     }
 
-    /// Forgets track and stamps, as after a camera's restart with a new clock; counters stay.
+    /// Clears track and stamps, as after a restart of a camera with a new clock. The counters are kept.
     pub fn reset(&mut self) {
         self.track = None;
         self.last_frame = None;
@@ -217,20 +219,20 @@ impl VisionCycle {
 
     /// Tracks one stereo pair.
     ///
-    /// `base_from_gripper` is the gripper in the robot's base at capture, by the encoders; only its change from frame
-    /// to frame is used. Without it the track's own velocity predicts, and a change of the rig can be told by the
-    /// marks alone. A motion that no gripper can make is not followed. A result with status [`VisionStatus::Lost`]
-    /// has no marks, a pose that means nothing, and a covariance of a million.
+    /// `base_from_gripper` is the gripper in the robot's base at capture, from the encoders; only its change from frame
+    /// to frame is used. Without it, the prediction uses the track's velocity, and only the marks can reveal a change
+    /// of the rig. An implausibly fast motion is rejected. A result with status [`VisionStatus::Lost`] has no marks, a
+    /// meaningless pose, and a covariance of 10^6.
     ///
     /// # Errors
-    /// [`FrameReject`] when the pair, or the pose found in it, is not to be believed. The caller publishes nothing
-    /// then, so that the last result ages; a *seen* loss of the marks is no error but a [`Vision`] with status
+    /// [`FrameReject`] if the pair, or the pose measured in it, is implausible. The caller then publishes nothing, so
+    /// that the last result ages. A *detected* loss of the marks is not an error but a [`Vision`] with status
     /// [`VisionStatus::Lost`].
     pub fn step(&mut self, frame: &StereoFrame<'_>, base_from_gripper: Option<Pose>) -> Result<Vision, FrameReject> {
         self.step_in_stages(frame, base_from_gripper, |_| {})
     }
 
-    /// The same, telling when each stage has ended, for those who measure time.
+    /// Like [`VisionCycle::step`]; calls `ended` at the end of each stage, for time measurements.
     ///
     /// # Errors
     /// See [`VisionCycle::step`].
@@ -256,17 +258,17 @@ impl VisionCycle {
             return Ok(self.miss(frame, track));
         };
         ended(StepStage::Pose);
-        // Before anything is refused: a moved camera is what would make the rest of this look wrong.
+        // Update the watch before any rejection: a displaced camera can cause the rejections below.
         let moves = self.watch.health().moves;
         let pose = &solved.estimate.left_from_gripper;
         self.freeze.update(frame, &table);
-        // A frozen image says nothing about the cameras, and much that is wrong beside moving encoders.
+        // A frozen image contains no information about the cameras and contradicts moving encoders.
         if self.freeze.run() == 0 {
             self.watch.update(&self.rig, &self.gripper, &solved.seen, pose, base_from_gripper.as_ref());
         }
         ended(StepStage::Watch);
         let moved = self.watch.health().moves != moves;
-        if !solved.sound {
+        if !solved.usable {
             return Ok(self.miss(frame, track));
         }
         let estimate = solved.estimate;
@@ -274,7 +276,7 @@ impl VisionCycle {
             && !moved
         {
             self.faults.count(&reject);
-            // A jump is first refused, then, if the marks stay where they cannot be, the track is given up.
+            // Reject a jump at first; drop the track if the marks stay at the implausible position.
             let misses = track.misses + 1;
             self.track = (misses <= 2).then_some(Track { misses, ..track });
             return Err(reject);
@@ -298,11 +300,11 @@ impl VisionCycle {
         }
     }
 
-    /// Pose to start from, and how far about it to search (pixels).
+    /// Predicted pose, and the search range around it (pixels).
     fn predict(&mut self, track: &Track, frame: &StereoFrame<'_>, base_from_gripper: Option<Pose>) -> (Pose, f64) {
         let search = self.settings.marks.search_px;
         let Some(at) = track.at_ns else { return (track.pose, 1.5 * search) };
-        let dt = seconds(at, stamp(frame));
+        let dt = seconds(at, mid_exposure_ns(frame.capture_ns));
         let widen = 1.0 + 0.5 * f64::from(track.misses.min(4));
         if let (Some(then), Some(now)) = (track.base_from_gripper, base_from_gripper) {
             let prior = track.pose * (then.inverse() * now);
@@ -311,14 +313,14 @@ impl VisionCycle {
             }
             self.faults.prior += 1;
         }
-        // Beyond a fifth of a second a constant velocity says nothing any more.
+        // Extrapolate with a constant velocity for at most a fifth of a second.
         (track.pose * exp_twist(&(track.velocity * dt.min(0.2))), search * widen)
     }
 
-    /// Measures every mark that `pose` puts before a camera and that `table` does not hold yet.
+    /// Measures every mark that faces a camera at `pose` and is not yet in `table`.
     ///
-    /// An error of the prediction moves the marks of a view nearly alike: each is looked for where those before it
-    /// were.
+    /// A prediction error moves all marks of a view by nearly the same amount, so each search starts at the mean shift
+    /// of the marks before it.
     fn measure(&mut self, frame: &StereoFrame<'_>, pose: &Pose, motion: &Pose, search_px: f64, table: &mut MarkTable) {
         let Self { rig, gripper, settings, meter, blur, .. } = self;
         for view in View::BOTH {
@@ -351,16 +353,16 @@ impl VisionCycle {
         }
     }
 
-    /// Solves, looks once more about the solution for marks that were missing or thrown out, and solves again.
+    /// Solves, measures missing and rejected marks once more near the solution, and solves again.
     fn solve(&mut self, frame: &StereoFrame<'_>, start: &Pose, motion: &Pose, table: &mut MarkTable) -> Option<Solved> {
         let mut seen = *table;
         let mut best = pose::estimate(&self.rig, &self.gripper, table, start, &self.settings.pose).ok()?;
         let dropped = pose::keep_used(table, &best);
         let narrow = (2.0 + 2.0 * best.residual_px).min(self.settings.marks.search_px);
-        // A large disc's centre lies off its outline's middle by an amount that depends on the tilt: predicted with a
-        // tilt that was wrong, all marks are measured anew.
+        // The offset between the centre of a large disc and the middle of its outline depends on the tilt: if the
+        // predicted tilt was wrong, measure all marks again.
         let turn = (start.rotation.inverse() * best.left_from_gripper.rotation).imag().norm_squared();
-        if turn > math::sq(0.5 * REMEASURE_TURN) {
+        if turn > math::sq(0.5 * REMEASURE_TURN_RAD) {
             *table = [[None; MAX_MARKS]; 2];
         }
         let had = count(table);
@@ -374,20 +376,20 @@ impl VisionCycle {
             pose::keep_used(table, &best);
         }
         self.faults.outliers += dropped;
-        self.together(&mut seen, table);
+        self.marks_for_watch(&mut seen, table);
         let worst = (0..3).map(|i| best.covariance[(i, i)]).fold(0.0, f64::max);
         let s = &self.settings;
         let pose = &best.left_from_gripper;
         let inner = Evidence::gather(&self.rig, &self.gripper, table, pose, s.rig.mark_px, None)
             .and_then(|e| e.offset(&s.rig.rig_error))
             .map_or(best.residual_px, |(_, inner)| inner);
-        let sound = best.distinct() >= s.min_marks && inner <= s.max_residual_px && worst <= s.max_sigma * s.max_sigma;
-        Some(Solved { estimate: best, sound, inner_residual_px: inner, seen })
+        let usable = best.distinct() >= s.min_marks && inner <= s.max_residual_px && worst <= s.max_sigma * s.max_sigma;
+        Some(Solved { estimate: best, usable, inner_residual_px: inner, seen })
     }
 
-    /// What the watch is shown. Single marks that the pose threw out are wrong themselves; but where more than half
-    /// of a view's marks were thrown out it is the view that does not fit, and all that was measured there counts.
-    fn together(&self, seen: &mut MarkTable, used: &MarkTable) {
+    /// Selects the marks for the rig watch. Single marks that the pose rejected are outliers. If more than half of the
+    /// marks of a view were rejected, the view itself does not fit, and all its marks are kept.
+    fn marks_for_watch(&self, seen: &mut MarkTable, used: &MarkTable) {
         for (seen, used) in seen.iter_mut().zip(used) {
             let measured = seen.iter().flatten().count();
             let kept = seen.iter().zip(used).filter(|(s, u)| s.is_some() && u.is_some()).count();
@@ -397,11 +399,11 @@ impl VisionCycle {
         }
     }
 
-    /// Whether a gripper can get from `a` to `b` in `dt` seconds; else how far it is.
+    /// Checks that the gripper can move from `a` to `b` in `dt` seconds; the error contains the distance.
     fn reachable(&self, a: &Pose, b: &Pose, dt: f64) -> Result<(), FrameReject> {
         let s = &self.settings;
         let xi = log_pose(&(a.inverse() * b));
-        // The origin's own displacement, not the screw's: a turn about a far axis is a long way for the origin.
+        // The displacement of the origin, not of the screw: a rotation about a distant axis moves the origin far.
         let moved = math::sqrt((b.translation.vector - a.translation.vector).norm_squared());
         let turned = math::sqrt(xi.fixed_rows::<3>(3).norm_squared());
         if moved <= s.max_speed * dt + s.jump_margin && turned <= s.max_turn * dt + 10.0 * s.jump_margin {
@@ -412,7 +414,7 @@ impl VisionCycle {
 
     fn jump(&self, track: &Track, frame: &StereoFrame<'_>, estimate: &PoseEstimate) -> Result<(), FrameReject> {
         let Some(at) = track.at_ns else { return Ok(()) };
-        self.reachable(&track.pose, &estimate.left_from_gripper, seconds(at, stamp(frame)))
+        self.reachable(&track.pose, &estimate.left_from_gripper, seconds(at, mid_exposure_ns(frame.capture_ns)))
     }
 
     fn publish(
@@ -424,7 +426,7 @@ impl VisionCycle {
         base_from_gripper: Option<Pose>,
     ) -> Vision {
         let e = &solved.estimate;
-        let now = stamp(frame);
+        let now = mid_exposure_ns(frame.capture_ns);
         let velocity = match track.at_ns {
             Some(at) if now > at => {
                 let dt = seconds(at, now);
@@ -438,7 +440,7 @@ impl VisionCycle {
         self.faults.in_a_row = 0;
         self.health.frozen_run = self.freeze.run();
         self.health.vertical_disparity_px = self.vertical_disparity(e, &table);
-        let status = self.judge(e, &velocity);
+        let status = self.status(e, &velocity);
         Vision {
             sequence: frame.sequence,
             capture_ns: frame.capture_ns,
@@ -453,9 +455,9 @@ impl VisionCycle {
         }
     }
 
-    /// Full speed needs, in each view, four marks that will still be in the image three frames on, and half of
-    /// those that face it.
-    fn judge(&mut self, e: &PoseEstimate, velocity: &Twist) -> VisionStatus {
+    /// The status is `Tracking` if each view has at least four used marks that will still be in the image in 0.1 s, and
+    /// if these are at least half of the marks that are expected in the view.
+    fn status(&mut self, e: &PoseEstimate, velocity: &Twist) -> VisionStatus {
         let soon = e.left_from_gripper * exp_twist(&(velocity * 0.1));
         let mut full = true;
         for view in View::BOTH {
@@ -494,7 +496,7 @@ impl VisionCycle {
 
     fn miss(&mut self, frame: &StereoFrame<'_>, track: Track) -> Vision {
         let misses = track.misses + 1;
-        // A seed that does not hold is wrong at once; a track gets a few frames to come back from behind something.
+        // A seed without a pose is dropped immediately; a track survives a few frames of occlusion.
         let keep = track.at_ns.is_some() && misses <= self.settings.coast_frames;
         self.track = keep.then_some(Track { misses, ..track });
         let mut v = self.lost(frame);
@@ -512,19 +514,13 @@ impl VisionCycle {
             marks: [[None; MAX_MARKS]; 2],
             seen: [0; 2],
             left_from_gripper: Pose::identity(),
-            // Finite, so that arithmetic on it stays finite, and so large that nobody can mistake it for knowledge.
+            // Finite, so that arithmetic on it stays finite, and too large to be used as a valid covariance.
             covariance: Matrix6::identity() * 1e6,
             residual_px: 0.0,
             inner_residual_px: 0.0,
             rig: self.watch.health(),
         }
     }
-}
-
-/// Mid-time of a pair.
-fn stamp(frame: &StereoFrame<'_>) -> u64 {
-    let [l, r] = frame.capture_ns;
-    l.min(r) + l.abs_diff(r) / 2
 }
 
 fn seconds(from: u64, to: u64) -> f64 {

@@ -1,9 +1,9 @@
-//! The pixels that tell where a mark is: those about its predicted rim, and flat ones on either side that tell the
-//! levels.
+//! The pixels of a mark that enter the fit: rim pixels around its predicted rim, which determine the position, and flat
+//! pixels on either side, which determine the levels.
 //!
-//! They are gathered row by row into contiguous arrays, sector by sector of the rim, so that the fit runs over them
-//! four at a time, and so that a sector in which something hides the rim can be left out. The number of pixels is
-//! bounded whatever the size of the mark: a longer rim is read in every second or third row.
+//! They are gathered row by row into contiguous arrays, ordered by sector of the rim. The fit processes four at a time,
+//! and a sector with an occluded rim can be excluded. The number of pixels is bounded for every size of mark: of a
+//! longer rim only every second or third row is read.
 
 use super::Outline;
 use crate::image::ImageView;
@@ -11,39 +11,39 @@ use crate::math;
 use nalgebra::Vector2;
 use wide::{f32x4, f32x8, i32x4};
 
-/// Most pixels about the rim.
-pub(crate) const MAX_RIM: usize = 896;
-/// Most flat pixels on either side.
-const MAX_FLAT: usize = 512;
-/// Sectors of the rim: six bands of rows, left and right.
+/// Maximum number of rim pixels.
+pub(crate) const MAX_RIM_PIXELS: usize = 896;
+/// Maximum number of flat pixels on either side.
+const MAX_FLAT_PIXELS: usize = 512;
+/// Number of sectors of the rim: six bands of rows, left and right.
 pub(crate) const SECTORS: usize = 12;
 const BLOCKS: usize = SECTORS / 2;
-/// Most rows that are read.
+/// Maximum number of rows that are read.
 const MAX_ROWS: usize = 112;
-/// Marks of at least this many rows have more flat pixels than their levels need: every second row of those is read.
-const DENSE_ROWS: usize = 18;
-/// Width of the flat bands, px.
-const FLAT: f64 = 1.8;
-/// Share of a mark's half width that is read outside its rim at most: a mark needs a margin of that much about it.
-const MARGIN: f64 = 0.5;
-/// What is read outside the rim of the smallest marks, px.
-const LEAST_MARGIN: f64 = 1.2;
+/// Minimum number of rows for which flat pixels are read in every second row only: the levels need no more.
+const MIN_SPARSE_ROWS: usize = 18;
+/// Width of each flat band, px.
+const FLAT_WIDTH_PX: f64 = 1.8;
+/// Maximum width that is read outside the rim, as a fraction of the half width: a mark needs this margin around it.
+const MAX_MARGIN_FRACTION: f64 = 0.5;
+/// Minimum width that is read outside the rim, px: small marks.
+const MIN_MARGIN_PX: f64 = 1.2;
 
-/// Columns of eight pixels from the first.
+/// Column offsets of eight consecutive pixels.
 const EIGHT: f32x8 = f32x8::new([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
 
-/// Pixels of one kind, by columns; positions from the mark's predicted centre.
+/// Pixels of one kind, as arrays; positions are relative to the mark's predicted centre.
 #[derive(Clone, Debug)]
 pub(crate) struct Pixels<const N: usize> {
     pub(crate) x: [f32; N],
     pub(crate) y: [f32; N],
     pub(crate) grey: [f32; N],
-    /// 1 for a pixel that counts, 0 for one that does not, and beyond `len`.
+    /// 1 for a pixel in use, 0 for an excluded one and for the padding beyond `len`.
     pub(crate) weight: [f32; N],
-    /// What the last fit leaves, grey values.
+    /// Residual of the last fit, grey values.
     pub(crate) residual: [f32; N],
     pub(crate) len: usize,
-    /// Where each sector begins, and the end.
+    /// Index of the first pixel of each sector, and the end.
     pub(crate) sector: [usize; SECTORS + 1],
 }
 
@@ -53,9 +53,10 @@ impl<const N: usize> Pixels<N> {
         Self { x: zero, y: zero, grey: zero, weight: zero, residual: zero, len: 0, sector: [0; SECTORS + 1] }
     }
 
-    /// Appends `count` pixels of a row from its column `from` on, the first at (`x`, `y`), as far as there is room.
+    /// Appends `count` pixels of a row, starting at column `from`. The first one is at (`x`, `y`). Pixels beyond the
+    /// capacity are dropped.
     ///
-    /// They are written by eights; what is written too much is written over by the next piece.
+    /// Pixels are written in groups of eight; the next call overwrites the excess of the last group.
     #[inline(always)]
     fn push(&mut self, row: &[u8], from: usize, count: usize, x: f32, y: f32) {
         let (mut from, mut count, mut x) = (from, count, x);
@@ -83,7 +84,7 @@ impl<const N: usize> Pixels<N> {
         }
     }
 
-    /// Gives every pixel its weight, and fills the last group of four up with copies that do not count.
+    /// Sets all weights to 1 and pads the last group of four with copies of weight 0.
     fn close(&mut self) {
         self.weight[..self.len].fill(1.0);
         for k in self.len..self.len.next_multiple_of(4).min(N) {
@@ -92,13 +93,13 @@ impl<const N: usize> Pixels<N> {
         }
     }
 
-    /// Takes a sector in (1) or leaves it out (0).
+    /// Includes (1) or excludes (0) a sector.
     pub(crate) fn weigh_sector(&mut self, k: usize, weight: f32) {
         let (from, to) = (self.sector[k], self.sector[k + 1]);
         self.weight[from..to].fill(weight);
     }
 
-    /// Pixels of a sector, and the sum of their squared residuals.
+    /// Number of pixels of a sector, and the sum of their squared residuals.
     pub(crate) fn squares(&self, k: usize) -> (f32, f32) {
         let (from, to) = (self.sector[k], self.sector[k + 1]);
         ((to - from) as f32, self.residual[from..to].iter().map(|r| r * r).sum())
@@ -106,27 +107,28 @@ impl<const N: usize> Pixels<N> {
 }
 
 /// Flat pixels of one side.
-pub(crate) type Flat = Pixels<MAX_FLAT>;
+pub(crate) type Flat = Pixels<MAX_FLAT_PIXELS>;
 
-/// The pixels of one mark, and where they lie against its predicted rim.
+/// The pixels of one mark, and their geometry relative to its predicted rim.
 #[derive(Clone, Debug)]
 pub(crate) struct Band {
-    pub(crate) rim: Pixels<MAX_RIM>,
+    pub(crate) rim: Pixels<MAX_RIM_PIXELS>,
     /// Flat pixels outside and inside.
     pub(crate) flat: [Flat; 2],
     /// Distance from the rim, positive inside, px.
-    pub(crate) depth: [f32; MAX_RIM],
+    pub(crate) depth: [f32; MAX_RIM_PIXELS],
     /// Outward unit normal of the rim.
-    pub(crate) normal: [[f32; MAX_RIM]; 2],
+    pub(crate) normal: [[f32; MAX_RIM_PIXELS]; 2],
     /// Curvature of the rim, 1/px.
-    pub(crate) curvature: [f32; MAX_RIM],
-    /// Rim pixels that would be there if the image did not end.
-    pub(crate) wanted: usize,
-    /// Sum of the pixels that were fetched ahead, which keeps the fetches.
+    pub(crate) curvature: [f32; MAX_RIM_PIXELS],
+    /// Number of rim pixels without clipping at the image border.
+    pub(crate) unclipped: usize,
+    /// Sum of the prefetched pixels; it keeps the compiler from removing the loads.
     touched: u8,
 }
 
-/// Boundaries in one row: first columns of outer flat, rim, inner flat and core; then the mirrored ends, core first.
+/// Column boundaries in one row: start of outer flat, rim, inner flat and core; middle; then the mirrored ends, core
+/// first.
 type Row = [i32; 9];
 
 impl Band {
@@ -134,16 +136,16 @@ impl Band {
         Self {
             rim: Pixels::new(),
             flat: [Pixels::new(), Pixels::new()],
-            depth: [0.0; MAX_RIM],
-            normal: [[0.0; MAX_RIM]; 2],
-            curvature: [0.0; MAX_RIM],
-            wanted: 0,
+            depth: [0.0; MAX_RIM_PIXELS],
+            normal: [[0.0; MAX_RIM_PIXELS]; 2],
+            curvature: [0.0; MAX_RIM_PIXELS],
+            unclipped: 0,
             touched: 0,
         }
     }
 
-    /// Reads the pixels about `outline` shifted by `shift`: the rim as far as `reach` px on either side, and flat ones
-    /// beyond.
+    /// Reads the pixels around `outline` shifted by `shift`: rim pixels up to `reach` px on either side, and flat
+    /// pixels beyond.
     pub(crate) fn gather(&mut self, image: &ImageView<'_>, outline: &Outline, shift: Vector2<f64>, reach: f64) {
         let limits = limits(outline, reach);
         let centre = outline.centre + shift;
@@ -153,13 +155,13 @@ impl Band {
         self.rim.len = 0;
         self.flat[0].len = 0;
         self.flat[1].len = 0;
-        self.wanted = 0;
+        self.unclipped = 0;
         let count = rows.count;
         let mut bounds = [[0_i32; 9]; MAX_ROWS];
         for (i, b) in bounds.iter_mut().take(count).enumerate() {
             let row = rows.first + i as i32 * rows.step;
             *b = rows.bounds(row);
-            // All rows are fetched at once: waiting for one after the other would be most of the time.
+            // Prefetch all rows first: serialised cache misses would dominate the run time.
             let y = base.y as i64 + i64::from(row);
             let pixels = if y >= 0 { image.row(y as usize) } else { &[] };
             for end in [b[0], b[8]] {
@@ -179,7 +181,7 @@ impl Band {
                         pixels,
                         base.x as i64,
                         b,
-                        (side, count < DENSE_ROWS || i % 2 == 0),
+                        (side, count < MIN_SPARSE_ROWS || i % 2 == 0),
                         [offset.x as f32, f64::from(row) as f32 - offset.y as f32],
                     );
                 }
@@ -189,7 +191,7 @@ impl Band {
         self.rim.close();
         self.flat[0].close();
         self.flat[1].close();
-        self.place(outline);
+        self.compute_distances(outline);
     }
 
     fn mark_sector(&mut self, k: usize) {
@@ -199,8 +201,8 @@ impl Band {
         }
     }
 
-    /// Takes one side of a row, its flat pixels only where `flat`. `at` is (column of the centre from `base`, row from
-    /// the centre).
+    /// Appends one side of a row; flat pixels only if `flat` is set. `at` is (column of the centre relative to `base`,
+    /// row relative to the centre).
     #[inline]
     fn take(&mut self, pixels: &[u8], base: i64, b: &Row, (side, flat): (usize, bool), at: [f32; 2]) {
         let [a0, a1, a2, a3, middle, b3, b2, b1, b0] = *b;
@@ -218,7 +220,7 @@ impl Band {
                 0 => self.flat[0].push(pixels, first, count, x, at[1]),
                 1 => {
                     self.rim.push(pixels, first, count, x, at[1]);
-                    self.wanted += (to - from) as usize;
+                    self.unclipped += (to - from) as usize;
                 }
                 _ => self.flat[1].push(pixels, first, count, x, at[1]),
             }
@@ -227,9 +229,9 @@ impl Band {
 
     /// Distance, normal and curvature of the predicted rim at each rim pixel.
     ///
-    /// With `u` the pixel in disc coordinates and `J` the map's derivative, the gradient of |u| is `Jᵀu/|u|`; along it
-    /// the rim, where |u| is 1, is met to second order. For a circle this is exact.
-    fn place(&mut self, outline: &Outline) {
+    /// With `u` the pixel in disc coordinates and `J` the derivative of the map, the gradient of |u| is `Jᵀu/|u|`. The
+    /// distance to the rim, |u| = 1, along this gradient is computed to second order. It is exact for a circle.
+    fn compute_distances(&mut self, outline: &Outline) {
         let l = outline.disc_from_pixel.linear.map(|v| f32x4::splat(v as f32));
         let q = outline.disc_from_pixel.square.map(|v| f32x4::splat(v as f32));
         let (l00, l01, l10, l11) = (l[(0, 0)], l[(0, 1)], l[(1, 0)], l[(1, 1)]);
@@ -251,7 +253,7 @@ impl Band {
             let g = one / g2.sqrt();
             let (nx, ny) = (gx * g, gy * g);
             let d = (one - rho) * g;
-            // Turn of the radial direction along the normal, and along the tangent.
+            // Rotation of the radial direction per unit length along the normal, and along the tangent.
             let (wn, wt) = (
                 (jvx * nx + jvy * ny) * u - (jux * nx + juy * ny) * v,
                 (jvy * nx - jvx * ny) * u - (juy * nx - jux * ny) * v,
@@ -266,7 +268,7 @@ impl Band {
     }
 }
 
-/// Four values from `k` on.
+/// Four values starting at `k`.
 #[inline(always)]
 pub(crate) fn four<const N: usize>(a: &[f32; N], k: usize) -> f32x4 {
     match a.get(k..k + 4) {
@@ -282,23 +284,23 @@ pub(crate) fn put<const N: usize>(a: &mut [f32; N], k: usize, v: f32x4) {
     }
 }
 
-/// Radii in disc coordinates: outer flat, rim outside, rim inside, inner flat.
+/// Boundary radii in disc coordinates: outer flat, rim outside, rim inside, inner flat.
 fn limits(outline: &Outline, reach: f64) -> [f64; 4] {
     let minor = outline.minor.max(0.5);
-    // How far the rim is from the ellipse of the first order.
+    // Deviation of the rim from the first-order ellipse.
     let bend = math::sqrt(outline.pixel_from_disc.square.norm_squared());
     let reach = reach + bend;
-    let margin = (MARGIN * minor).max(LEAST_MARGIN);
+    let margin = (MAX_MARGIN_FRACTION * minor).max(MIN_MARGIN_PX);
     let outside = reach.min(margin);
     [
-        1.0 + (outside + FLAT).min(margin) / minor,
+        1.0 + (outside + FLAT_WIDTH_PX).min(margin) / minor,
         1.0 + outside / minor,
         (1.0 - reach / minor).max(0.0),
-        (1.0 - (reach + FLAT) / minor).max(0.0),
+        (1.0 - (reach + FLAT_WIDTH_PX) / minor).max(0.0),
     ]
 }
 
-/// The rows that cross a mark, and where each crosses the four ellipses.
+/// The rows that cross a mark, and their intersections with the four ellipses.
 struct Rows {
     first: i32,
     step: i32,
@@ -323,7 +325,7 @@ impl Rows {
         let half = half.min(4.0 * MAX_ROWS as f64);
         let first = math::ceil(offset.y - half);
         let span = (math::floor(offset.y + half) - first + 1.0).max(0.0);
-        let step = math::ceil(1.05 * rim / MAX_RIM as f64).max(math::ceil(span / MAX_ROWS as f64)).max(1.0);
+        let step = math::ceil(1.05 * rim / MAX_RIM_PIXELS as f64).max(math::ceil(span / MAX_ROWS as f64)).max(1.0);
         Self {
             first: first as i32,
             step: step as i32,
@@ -336,7 +338,7 @@ impl Rows {
     }
 
     fn bounds(&self, row: i32) -> Row {
-        /// Makes every column positive, so that truncation rounds down.
+        /// Offset that makes every column positive, so that truncation rounds down.
         const UP: f32 = 1024.0;
         let y = row as f32 - self.offset[1];
         let middle = self.offset[0] + self.lean * y;

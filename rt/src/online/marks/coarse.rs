@@ -1,8 +1,9 @@
-//! Where in its window a mark is, to within a fraction of its radius: a vote of ring samples.
+//! Locates a mark in its window to within a fraction of its radius, by a vote of ring samples.
 //!
-//! For a shift of the predicted outline, each direction compares the grey just inside with the grey just outside. A
-//! disc of another size scores little (one of its two rings is wrong everywhere), a half hidden one still peaks at the
-//! right place, and the work is a fixed number of samples whatever the image holds (fault M07).
+//! For each shift of the predicted outline and each direction, the vote compares the grey value just inside the rim
+//! with the one just outside. A disc of another size has a low score, because one of its two rings is wrong everywhere.
+//! A half occluded disc still peaks at the correct position. The number of samples is fixed and does not depend on the
+//! image content.
 
 use super::Outline;
 use super::outline::OutlinePoint;
@@ -11,14 +12,14 @@ use crate::math;
 use nalgebra::Vector2;
 
 const MAX_DIRECTIONS: usize = 16;
-/// Shifts tried along each axis at most.
-const MAX_SIDE: usize = 21;
+/// Maximum number of shifts that are tried along each axis.
+const MAX_SHIFTS: usize = 21;
 
 /// Best shift of the outline and its score.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Coarse {
     pub(crate) shift: Vector2<f64>,
-    /// 1 for a clean disc of the right polarity, about 0 for nothing, negative for the opposite polarity.
+    /// 1 for an undisturbed disc of the expected polarity, about 0 without a disc, negative for the opposite polarity.
     pub(crate) score: f64,
 }
 
@@ -56,7 +57,7 @@ impl Vote<'_, '_> {
 
 /// Searches shifts up to `range` pixels along each axis. `sign` is +1 for a dark mark, -1 for a light one.
 ///
-/// The prediction itself is taken without a search when it already explains the image.
+/// Returns the prediction without a search if it already has a high score.
 pub(crate) fn search(
     image: &ImageView<'_>,
     outline: &Outline,
@@ -80,15 +81,15 @@ pub(crate) fn search(
         return None;
     }
     let vote = Vote { image, rings, sign, contrast: 0.6 * contrast };
-    let home = Coarse { shift: Vector2::zeros(), score: vote.score(Vector2::zeros()) };
-    if home.score > 0.9 || range <= 0.0 {
-        return Some(home);
+    let predicted = Coarse { shift: Vector2::zeros(), score: vote.score(Vector2::zeros()) };
+    if predicted.score > 0.9 || range <= 0.0 {
+        return Some(predicted);
     }
-    let step = (0.5 * outline.minor).clamp(1.0, 8.0).max(2.0 * range / (MAX_SIDE - 1) as f64);
-    let side = ((range / step) as i32).min((MAX_SIDE as i32 - 1) / 2);
-    // A tie goes to the shift nearest to the prediction.
+    let step = (0.5 * outline.minor).clamp(1.0, 8.0).max(2.0 * range / (MAX_SHIFTS - 1) as f64);
+    let side = ((range / step) as i32).min((MAX_SHIFTS as i32 - 1) / 2);
+    // Of shifts with equal scores, the one nearest to the prediction ranks first.
     let rank = |c: &Coarse| c.score - 0.1 * c.shift.norm_squared() / (range * range);
-    let mut best = home;
+    let mut best = predicted;
     for j in -side..=side {
         for i in -side..=side {
             let shift = Vector2::new(f64::from(i) * step, f64::from(j) * step);
@@ -100,10 +101,10 @@ pub(crate) fn search(
     }
     let mut fine = 0.5 * step;
     for _ in 0..2 {
-        let about = best.shift;
+        let base = best.shift;
         for j in -1..=1 {
             for i in -1..=1 {
-                let shift = about + Vector2::new(f64::from(i) * fine, f64::from(j) * fine);
+                let shift = base + Vector2::new(f64::from(i) * fine, f64::from(j) * fine);
                 let c = Coarse { shift, score: vote.score(shift) };
                 if rank(&c) > rank(&best) {
                     best = c;
@@ -115,7 +116,7 @@ pub(crate) fn search(
     Some(best)
 }
 
-/// Grey levels between the 2 % and the 98 % point of a subsampled window, as a difference.
+/// Difference between the 98 % and the 2 % quantile of the grey values in a subsampled window.
 fn contrast(image: &ImageView<'_>, outline: &Outline, range: f64) -> Option<f64> {
     let half = outline.major + range + 2.0;
     let lo = |c: f64, n: usize| math::floor(c - half).clamp(0.0, n as f64 - 1.0) as usize;

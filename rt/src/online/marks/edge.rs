@@ -1,29 +1,29 @@
-//! The edge of a disc along one normal of its outline, to a few hundredths of a pixel.
+//! Locates the edge of a disc along one normal of its outline to a few hundredths of a pixel.
 
 use super::outline::OutlinePoint;
 use crate::image::ImageView;
 use nalgebra::Vector2;
 
-/// Distance between samples along a normal, pixels.
-const STEP: f64 = 0.5;
+/// Distance between samples along a normal, px.
+const STEP_PX: f64 = 0.5;
 const MAX_SAMPLES: usize = 64;
-/// Samples on either side over which a step is judged, and beyond which its levels are read.
-const NEAR: usize = 3;
+/// Number of samples on either side that measure a step; the levels are read beyond them.
+const NEAR_SAMPLES: usize = 3;
 
-/// One edge found.
+/// An edge.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Edge {
     /// Offset from the outline along its outward normal, pixels.
     pub(crate) offset: f64,
-    /// Grey difference outside minus inside, positive for the wanted polarity.
+    /// Grey difference outside minus inside, positive for the expected polarity.
     pub(crate) contrast: f64,
 }
 
-/// Finds the strongest edge of the wanted polarity between `-inward` and `outward` pixels of the (shifted) outline
+/// Finds the strongest edge of the expected polarity between `-inward` and `outward` pixels from the (shifted) outline
 /// point.
 ///
-/// The position is where the grey is half way between its levels on both sides. Blur and the pixels' own area smear the
-/// step evenly to both sides, so that this point stays on the true edge.
+/// The edge is where the grey value is half way between the levels on both sides. Blur and pixel area spread the step
+/// symmetrically, so this point stays on the true edge.
 pub(crate) fn find(
     image: &ImageView<'_>,
     point: &OutlinePoint,
@@ -33,13 +33,13 @@ pub(crate) fn find(
     outward: f64,
 ) -> Option<Edge> {
     let base = point.pixel + shift;
-    let count = (((inward + outward) / STEP) as usize + 1).min(MAX_SAMPLES);
-    if count < 2 * NEAR + 1 {
+    let count = (((inward + outward) / STEP_PX) as usize + 1).min(MAX_SAMPLES);
+    if count < 2 * NEAR_SAMPLES + 1 {
         return None;
     }
     let mut v = [0.0_f64; MAX_SAMPLES];
     let v = v.get_mut(..count)?;
-    let (from, step) = (base - point.normal * inward, point.normal * STEP);
+    let (from, step) = (base - point.normal * inward, point.normal * STEP_PX);
     if !image.profile(from.x, from.y, step.x, step.y, v) {
         return None;
     }
@@ -48,23 +48,23 @@ pub(crate) fn find(
             *v = -*v;
         }
     }
-    // The step between samples i and i + 1, from the NEAR samples on either side.
+    // The step between samples i and i + 1, from the NEAR_SAMPLES samples on either side.
     let (mut at, mut best) = (0, 0.0);
-    for (i, w) in v.windows(2 * NEAR).enumerate() {
+    for (i, w) in v.windows(2 * NEAR_SAMPLES).enumerate() {
         let [a, b, c, d, e, f] = w else { break };
         let step = (d + e + f) - (a + b + c);
         if step > best {
-            (at, best) = (i + NEAR - 1, step);
+            (at, best) = (i + NEAR_SAMPLES - 1, step);
         }
     }
     if best <= 0.0 {
         return None;
     }
-    // Levels from beyond the smear; at the ends of the profile, from what there is.
-    let low_from = at.saturating_sub(NEAR + 2);
-    let low = mean(v.get(low_from..=at.saturating_sub(NEAR).max(low_from + 1))?);
-    let high_to = (at + NEAR + 3).min(count - 1);
-    let high = mean(v.get((at + 1 + NEAR).min(high_to - 1)..=high_to)?);
+    // Levels from beyond the blurred step; near the ends of the profile from the samples that remain.
+    let low_from = at.saturating_sub(NEAR_SAMPLES + 2);
+    let low = mean(v.get(low_from..=at.saturating_sub(NEAR_SAMPLES).max(low_from + 1))?);
+    let high_to = (at + NEAR_SAMPLES + 3).min(count - 1);
+    let high = mean(v.get((at + 1 + NEAR_SAMPLES).min(high_to - 1)..=high_to)?);
     let contrast = high - low;
     if !(contrast > 0.0) {
         return None;
@@ -72,7 +72,7 @@ pub(crate) fn find(
     let middle = 0.5 * (low + high);
     let mut found: Option<f64> = None;
     let centre = at as f64 + 0.5;
-    for i in at.saturating_sub(NEAR)..(at + NEAR).min(count - 1) {
+    for i in at.saturating_sub(NEAR_SAMPLES)..(at + NEAR_SAMPLES).min(count - 1) {
         let (a, b) = (*v.get(i)?, *v.get(i + 1)?);
         if a <= middle && b > middle {
             let x = i as f64 + (middle - a) / (b - a);
@@ -81,7 +81,7 @@ pub(crate) fn find(
             }
         }
     }
-    found.map(|x| Edge { offset: x * STEP - inward, contrast })
+    found.map(|x| Edge { offset: x * STEP_PX - inward, contrast })
 }
 
 fn mean(v: &[f64]) -> f64 {

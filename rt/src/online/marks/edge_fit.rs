@@ -1,16 +1,16 @@
-//! Shift and small deformation that carry the predicted outline onto the edges found.
+//! Fits a shift and a small deformation of the predicted outline to the edges.
 
 use super::Outline;
 use super::edge::Edge;
-use super::outline::{MAX_OUTLINE, OutlinePoint};
+use super::outline::{MAX_OUTLINE_POINTS, OutlinePoint};
 use crate::math;
 use nalgebra::{Matrix5, Vector2, Vector5};
 
-/// How far the shape may be from the prediction before edges tell (one sigma of a relative stretch): a small arc then
-/// still gives a centre, with the prediction's shape.
+/// Prior of the shape: standard deviation of the relative stretch. With this prior a small arc still gives a centre,
+/// with the predicted shape.
 const SHAPE_SIGMA: f64 = 0.05;
-/// Nothing is believed to be better than this, pixels: pixels have structure that noise models do not know.
-const EDGE_FLOOR: f64 = 0.015;
+/// Minimum standard deviation of an edge, px: pixels have structure that noise models do not contain.
+const EDGE_FLOOR_PX: f64 = 0.015;
 
 /// Shift and symmetric stretch (xx, xy, yy), relative to the predicted outline.
 #[derive(Clone, Copy, Debug, Default)]
@@ -19,24 +19,24 @@ pub(crate) struct Fit {
     pub(crate) stretch: [f64; 3],
     /// Weighted root mean square distance of the used edges, pixels.
     pub(crate) rms: f64,
-    /// Sum of the weights over the number of outline points: the share of the rim that agrees.
-    pub(crate) share: f64,
+    /// Sum of the weights divided by the number of outline points: the fraction of the rim that agrees with the fit.
+    pub(crate) fraction: f64,
 }
 
-/// Where a point of the outline goes under a fit, as a shift of that point.
-pub(crate) fn moved(fit: &Fit, q: Vector2<f64>) -> Vector2<f64> {
+/// Displacement by a fit of an outline point at `q` from the centre.
+pub(crate) fn displacement(fit: &Fit, q: Vector2<f64>) -> Vector2<f64> {
     let [xx, xy, yy] = fit.stretch;
     fit.shift + Vector2::new(xx * q.x + xy * q.y, xy * q.x + yy * q.y)
 }
 
-/// An edge's equation: its row of derivatives, and the offset found.
+/// Observation equation of an edge: its row of derivatives, and the measured offset.
 #[derive(Clone, Copy)]
 struct Line {
     a: [f64; 5],
     offset: f64,
 }
 
-type Lines = heapless::Vec<Line, MAX_OUTLINE>;
+type Lines = heapless::Vec<Line, MAX_OUTLINE_POINTS>;
 
 impl Line {
     fn residual(&self, x: &Vector5<f64>) -> f64 {
@@ -45,11 +45,11 @@ impl Line {
     }
 }
 
-/// Refines `from` by edges measured relative to the outline as `from` moved it; robust (Tukey) least squares.
+/// Refines `from` by robust (Tukey) least squares. The edges are measured relative to the outline moved by `from`.
 pub(crate) fn refine(
     outline: &Outline,
     points: &[OutlinePoint],
-    edges: &[Option<Edge>; MAX_OUTLINE],
+    edges: &[Option<Edge>; MAX_OUTLINE_POINTS],
     from: &Fit,
 ) -> Option<Fit> {
     let mut lines = Lines::new();
@@ -69,27 +69,27 @@ pub(crate) fn refine(
         if !next.iter().all(|v| v.is_finite()) {
             return None;
         }
-        let settled = (next - x).norm_squared() < 1e-6;
+        let converged = (next - x).norm_squared() < 1e-6;
         x = next;
-        let mut left: heapless::Vec<f64, MAX_OUTLINE> = heapless::Vec::new();
+        let mut left: heapless::Vec<f64, MAX_OUTLINE_POINTS> = heapless::Vec::new();
         for l in &lines {
             let _ = left.push(math::fabs(l.residual(&x)));
         }
-        let found = (1.4826 * middle(&mut left)).max(2.0 * EDGE_FLOOR);
-        if round > 0 && (settled || round == 4) {
+        let found = (1.4826 * median(&mut left)).max(2.0 * EDGE_FLOOR_PX);
+        if round > 0 && (converged || round == 4) {
             let fit = Fit {
                 shift: from.shift + Vector2::new(x[0], x[1]),
                 stretch: [from.stretch[0] + x[2], from.stretch[1] + x[3], from.stretch[2] + x[4]],
                 ..Fit::default()
             };
-            return judged(fit, points.len(), &lines, &x, found);
+            return evaluate(fit, points.len(), &lines, &x, found);
         }
         spread = found;
     }
     None
 }
 
-/// Normal equations of the shift and the stretch, with the prior that the shape is the predicted one.
+/// Normal equations of the shift and the stretch, with the prior that the shape is as predicted.
 fn equations(lines: &Lines, x: &Vector5<f64>, spread: f64, early: bool, from: &Fit) -> (Matrix5<f64>, Vector5<f64>) {
     let (inv, inv_var) = (1.0 / spread, 1.0 / (spread * spread));
     let mut n = Matrix5::zeros();
@@ -118,8 +118,8 @@ fn equations(lines: &Lines, x: &Vector5<f64>, spread: f64, early: bool, from: &F
     (n, g)
 }
 
-/// Share of the rim and spread of a solution.
-fn judged(fit: Fit, points: usize, lines: &Lines, x: &Vector5<f64>, spread: f64) -> Option<Fit> {
+/// Adds the agreeing fraction of the rim and the spread to a solution; `None` if fewer than five edges agree.
+fn evaluate(fit: Fit, points: usize, lines: &Lines, x: &Vector5<f64>, spread: f64) -> Option<Fit> {
     let (mut sw, mut swr2) = (0.0, 0.0);
     for l in lines {
         let r = l.residual(x);
@@ -130,7 +130,7 @@ fn judged(fit: Fit, points: usize, lines: &Lines, x: &Vector5<f64>, spread: f64)
     if sw < 5.0 {
         return None;
     }
-    Some(Fit { rms: math::sqrt(swr2 / sw), share: sw / points as f64, ..fit })
+    Some(Fit { rms: math::sqrt(swr2 / sw), fraction: sw / points as f64, ..fit })
 }
 
 fn row(n: Vector2<f64>, q: Vector2<f64>) -> [f64; 5] {
@@ -138,19 +138,19 @@ fn row(n: Vector2<f64>, q: Vector2<f64>) -> [f64; 5] {
 }
 
 fn initial_spread(lines: &Lines) -> f64 {
-    let mut offsets: heapless::Vec<f64, MAX_OUTLINE> = heapless::Vec::new();
+    let mut offsets: heapless::Vec<f64, MAX_OUTLINE_POINTS> = heapless::Vec::new();
     for l in lines {
         let _ = offsets.push(l.offset);
     }
-    let m = middle(&mut offsets);
+    let m = median(&mut offsets);
     for o in &mut offsets {
         *o = math::fabs(*o - m);
     }
-    (1.4826 * middle(&mut offsets)).clamp(0.1, 2.0)
+    (1.4826 * median(&mut offsets)).clamp(0.1, 2.0)
 }
 
-/// The middle value of a list, in any order; 0 of none.
-pub(crate) fn middle(v: &mut [f64]) -> f64 {
+/// Median of an unsorted list; 0 if it is empty.
+pub(crate) fn median(v: &mut [f64]) -> f64 {
     if v.is_empty() {
         return 0.0;
     }

@@ -1,39 +1,39 @@
-//! The fit of the pixel-integrated disc to grey values: Gauss-Newton on the shift, the levels, the light's slope, and,
-//! where asked for, the blur and the shape.
+//! Fits the pixel-integrated disc to grey values: Gauss-Newton on the shift, the levels, the slope of the illumination
+//! and, optionally, the blur and the shape.
 //!
-//! A pixel at `x` from the mark's centre is `(1 + slope·x) (outside + (inside - outside) c)`, with `c` the share of it
-//! that the disc covers. The derivative of `c` by the rim's distance is the rim's length inside the pixel, so that the
-//! information about the shift sits in the pixels that the rim crosses; the flat ones tell the levels. docs/TRACKER.md
-//! derives the model.
+//! A pixel at `x` from the mark's centre is `(1 + slope·x) (outside + (inside - outside) c)`, with `c` the fraction of
+//! it that the disc covers. The derivative of `c` with respect to the distance from the rim is the length of the rim
+//! inside the pixel. The pixels that the rim crosses therefore contain the information about the shift; the flat pixels
+//! determine the levels. docs/TRACKER.md derives the model.
 
 use super::band::{Band, Pixels, four, put};
-use super::coverage::{Cover, Profile, Smear, trapezoid};
+use super::coverage::{Cover, PointSpread, Profile, trapezoid};
 use nalgebra::{SMatrix, SVector};
 use wide::f32x4;
 
-/// Shift (2), levels outside and inside, slope (2).
+/// Number of unknowns of the plain model: shift (2), levels outside and inside, slope (2).
 pub(crate) const PLAIN: usize = 6;
-/// The same, and the blur's variance and the stretch (3).
-pub(crate) const WHOLE: usize = 10;
+/// Number of unknowns of the full model: those of the plain model, variance of the blur, stretch (3).
+pub(crate) const FULL: usize = 10;
 
-/// What is fitted.
+/// Parameters of the fit.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Model {
-    /// Shift of the outline that the band was gathered for, px.
+    /// Shift relative to the outline for which the band was gathered, px.
     pub(crate) shift: [f32; 2],
     /// Grey values outside and inside.
     pub(crate) level: [f32; 2],
-    /// Relative slope of the light, 1/px.
+    /// Relative slope of the illumination, 1/px.
     pub(crate) slope: [f32; 2],
-    pub(crate) smear: Smear,
+    pub(crate) psf: PointSpread,
     /// Symmetric stretch (xx, xy, yy) of that outline.
     pub(crate) stretch: [f32; 3],
 }
 
 impl Model {
-    /// Nothing known but the blur and the motion.
-    pub(crate) fn new(smear: Smear) -> Self {
-        Self { shift: [0.0; 2], level: [0.0; 2], slope: [0.0; 2], smear, stretch: [0.0; 3] }
+    /// A model with the given blur and motion; all other parameters are zero.
+    pub(crate) fn new(psf: PointSpread) -> Self {
+        Self { shift: [0.0; 2], level: [0.0; 2], slope: [0.0; 2], psf, stretch: [0.0; 3] }
     }
 
     /// Grey difference inside minus outside.
@@ -43,14 +43,14 @@ impl Model {
 
     /// Adds a solution in the order of the columns.
     pub(crate) fn add(&mut self, p: &[f64]) {
-        let Self { shift: [sx, sy], level: [l0, l1], slope: [gx, gy], smear, stretch: [xx, xy, yy] } = self;
-        for (v, p) in [sx, sy, l0, l1, gx, gy, &mut smear.variance, xx, xy, yy].into_iter().zip(p) {
+        let Self { shift: [sx, sy], level: [l0, l1], slope: [gx, gy], psf, stretch: [xx, xy, yy] } = self;
+        for (v, p) in [sx, sy, l0, l1, gx, gy, &mut psf.variance, xx, xy, yy].into_iter().zip(p) {
             *v += *p as f32;
         }
     }
 }
 
-/// Normal equations, and what the residuals say of the noise.
+/// Normal equations, and the sums from which the noise is estimated.
 #[derive(Clone, Debug)]
 pub(crate) struct Equations<const N: usize> {
     pub(crate) matrix: SMatrix<f64, N, N>,
@@ -60,7 +60,7 @@ pub(crate) struct Equations<const N: usize> {
     /// Sum of those weights, and of their squares.
     pub(crate) weights: f64,
     pub(crate) weights2: f64,
-    /// Flat pixels that count, and their squared residuals.
+    /// Number of flat pixels in use, and the sum of their squared residuals.
     pub(crate) flat: (f64, f64),
 }
 
@@ -68,12 +68,12 @@ pub(crate) struct Equations<const N: usize> {
 struct Lane<const N: usize> {
     columns: [f32x4; N],
     residual: f32x4,
-    /// Squared derivative by the distance from the rim.
+    /// Squared derivative with respect to the distance from the rim.
     gain2: f32x4,
 }
 
 #[inline(always)]
-fn lane<const N: usize>(band: &Band, k: usize, m: &Model, profile: &Profile, bare: bool) -> Lane<N> {
+fn lane<const N: usize>(band: &Band, k: usize, m: &Model, profile: &Profile, sharp: bool) -> Lane<N> {
     let (x, y, grey) = (four(&band.rim.x, k), four(&band.rim.y, k), four(&band.rim.grey, k));
     let (nx, ny) = (four(&band.normal[0], k), four(&band.normal[1], k));
     let (d0, curvature) = (four(&band.depth, k), four(&band.curvature, k));
@@ -85,14 +85,14 @@ fn lane<const N: usize>(band: &Band, k: usize, m: &Model, profile: &Profile, bar
         let [xx, xy, yy] = m.stretch;
         d += nx * (qx * xx + qy * xy) + ny * (qx * xy + qy * yy);
     }
-    let Cover { share, chord, widen } =
-        if bare { trapezoid(d, nx.abs(), ny.abs(), curvature) } else { profile.cover(d, nx, ny, curvature) };
+    let Cover { fraction, chord, widen } =
+        if sharp { trapezoid(d, nx.abs(), ny.abs(), curvature) } else { profile.cover(d, nx, ny, curvature) };
     let light = x * m.slope[0] + y * m.slope[1] + 1.0;
-    let mean = share * m.step() + m.level[0];
+    let mean = fraction * m.step() + m.level[0];
     let step = light * m.step();
     let b = chord * step;
     let (bx, by) = (b * nx, b * ny);
-    let inside = light * share;
+    let inside = light * fraction;
     let all = [bx, by, light - inside, inside, mean * x, mean * y, widen * step, bx * qx, bx * qy + by * qx, by * qy];
     let mut columns = [f32x4::ZERO; N];
     for (c, a) in columns.iter_mut().zip(all) {
@@ -103,13 +103,13 @@ fn lane<const N: usize>(band: &Band, k: usize, m: &Model, profile: &Profile, bar
 
 /// Derivatives and residuals of a model, with the normal matrix.
 pub(crate) fn equations<const N: usize>(band: &Band, m: &Model) -> Equations<N> {
-    let profile = Profile::new(&m.smear);
-    let bare = N == PLAIN && profile.is_bare();
+    let profile = Profile::new(&m.psf);
+    let sharp = N == PLAIN && profile.is_sharp();
     let mut sum = [[f32x4::ZERO; N]; N];
     let mut right = [f32x4::ZERO; N];
     let (mut squares, mut weights, mut weights2) = (f32x4::ZERO, f32x4::ZERO, f32x4::ZERO);
     for k in (0..band.rim.len).step_by(4) {
-        let l: Lane<N> = lane(band, k, m, &profile, bare);
+        let l: Lane<N> = lane(band, k, m, &profile, sharp);
         let w = four(&band.rim.weight, k);
         for (i, (sums, right)) in sum.iter_mut().zip(&mut right).enumerate() {
             let c = l.columns[i] * w;
@@ -147,7 +147,7 @@ pub(crate) fn equations<const N: usize>(band: &Band, m: &Model) -> Equations<N> 
     e
 }
 
-/// Adds the flat pixels of one side: they see its level and the slope.
+/// Adds the flat pixels of one side: they depend on its level and the slope.
 fn flat<const N: usize, const M: usize>(p: &Pixels<M>, m: &Model, side: usize, e: &mut Equations<N>) {
     let level = m.level[side];
     let mut s = [f32x4::ZERO; 11];
@@ -177,16 +177,15 @@ fn flat<const N: usize, const M: usize>(p: &Pixels<M>, m: &Model, side: usize, e
     e.flat = (e.flat.0 + s[10], e.flat.1 + s[9]);
 }
 
-/// Residuals of a model, kept in the band, and their products with the derivatives: half the work of [`equations`].
-///
-/// `e` keeps its matrix.
+/// Computes the residuals of a model, stores them in the band, and updates the right side and the sums of `e`. The
+/// matrix of `e` is unchanged. This is half the work of [`equations`].
 pub(crate) fn residuals<const N: usize>(band: &mut Band, m: &Model, e: &mut Equations<N>) {
-    let profile = Profile::new(&m.smear);
-    let bare = N == PLAIN && profile.is_bare();
+    let profile = Profile::new(&m.psf);
+    let sharp = N == PLAIN && profile.is_sharp();
     let mut right = [f32x4::ZERO; N];
     let (mut squares, mut weights, mut weights2) = (f32x4::ZERO, f32x4::ZERO, f32x4::ZERO);
     for k in (0..band.rim.len).step_by(4) {
-        let l: Lane<N> = lane(band, k, m, &profile, bare);
+        let l: Lane<N> = lane(band, k, m, &profile, sharp);
         let w = four(&band.rim.weight, k);
         let r = l.residual * w;
         for (s, c) in right.iter_mut().zip(l.columns) {

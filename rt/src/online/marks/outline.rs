@@ -1,22 +1,22 @@
-//! The predicted image of one mark: the map between its disc and the pixels about it.
+//! Predicts the image of one mark: the map between its disc and the pixels around it.
 //!
-//! The image of a disc's rim is no ellipse under distortion, and the image of the disc's centre is neither its centroid
-//! nor its ellipse's centre (literature: discocal 2024). The map from disc to pixels is therefore kept to second order,
-//! fitted to eight exactly projected rim points: what it leaves out is of the order of the square of (radius /
-//! distance), 1e-5 of a radius at work distance. How the predicted rim has to be *shifted* to fit the image then gives
-//! the image of the centre without bias.
+//! The image of a disc's rim is not an ellipse under distortion, and the image of the disc's centre is neither its
+//! centroid nor the centre of its ellipse (literature: discocal 2024). The map from disc to pixels is therefore of
+//! second order and fitted to eight exactly projected rim points. Its error is of the order of (radius / distance)²,
+//! 1e-5 of a radius at working distance. The *shift* that fits the predicted rim to the image then gives the image of
+//! the centre without bias.
 
 use crate::geom::{Camera, Pixel, Pose, Vec3};
 use crate::gripper::Mark;
 use crate::math;
 use nalgebra::{Matrix2, Matrix2x3, Point3, Vector2, Vector3};
 
-/// The largest number of points on a predicted outline.
-pub const MAX_OUTLINE: usize = 48;
-const MIN_OUTLINE: usize = 16;
+/// Maximum number of points on a predicted outline.
+pub const MAX_OUTLINE_POINTS: usize = 48;
+const MIN_OUTLINE_POINTS: usize = 16;
 /// Cosine of 45 degrees.
 const HALF: f64 = core::f64::consts::FRAC_1_SQRT_2;
-/// The eight rim points at which the map is fitted, on the unit circle; the second four are opposite to the first.
+/// Four of the eight rim points to which the map is fitted, on the unit circle; the other four are opposite to them.
 const NODES: [(f64, f64); 4] = [(1.0, 0.0), (HALF, HALF), (0.0, 1.0), (-HALF, HALF)];
 
 /// One point of a predicted outline.
@@ -26,12 +26,12 @@ pub struct OutlinePoint {
     pub pixel: Pixel,
     /// Unit normal pointing out of the disc.
     pub normal: Vector2<f64>,
-    /// Distance from the disc's centre to the tangent here, pixels: how far one may walk inwards before reaching the
-    /// far half.
+    /// Distance from the disc's centre to the tangent at this point, pixels: the maximum inward distance before the
+    /// opposite half.
     pub support: f64,
 }
 
-/// A map of the plane about a centre, to second order: `linear * u + square * (u.x², u.x u.y, u.y²)`.
+/// A second-order map of the plane around a centre: `linear * u + square * (u.x², u.x u.y, u.y²)`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Quadratic {
     /// First order.
@@ -46,7 +46,7 @@ impl Quadratic {
         self.linear * u + self.square * monomials(u)
     }
 
-    /// From the values at the eight nodes of the unit circle: `plus[k]` at node k, `minus[k]` opposite to it.
+    /// Fits a map to the values at the eight nodes of the unit circle: `plus[k]` at node k, `minus[k]` opposite to it.
     fn through(plus: &[Vector2<f64>; 4], minus: &[Vector2<f64>; 4]) -> Self {
         let even: [Vector2<f64>; 4] = core::array::from_fn(|k| (plus[k] + minus[k]) * 0.5);
         let mut linear = Matrix2::zeros();
@@ -57,7 +57,7 @@ impl Quadratic {
         Self { linear, square: Matrix2x3::from_columns(&[even[0], even[1] - even[3], even[2]]) }
     }
 
-    /// The same with its argument first mapped by `m`.
+    /// The composition of this map with `m`: `m` is applied first.
     fn after(&self, m: &Matrix2<f64>) -> Self {
         let (a, b) = (m.column(0).into_owned(), m.column(1).into_owned());
         let (aa, bb) = (monomials(a), monomials(b));
@@ -71,7 +71,7 @@ fn monomials(u: Vector2<f64>) -> Vector3<f64> {
     Vector3::new(u.x * u.x, u.x * u.y, u.y * u.y)
 }
 
-/// Where a mark's disc is in an image, and how large: from one projection.
+/// Position and size of a mark's disc in an image, from one projection.
 #[derive(Clone, Copy, Debug)]
 pub struct Footprint {
     /// Image of the disc's centre.
@@ -95,17 +95,17 @@ pub struct Outline {
     pub minor: f64,
     /// Cosine of the angle between the disc's normal and the direction to the camera.
     pub facing: f64,
-    /// Pixels from the centre, from disc coordinates (the rim is the unit circle).
+    /// Map from disc coordinates (the rim is the unit circle) to pixels relative to the centre.
     pub pixel_from_disc: Quadratic,
-    /// Disc coordinates from pixels from the centre.
+    /// Map from pixels relative to the centre to disc coordinates.
     pub disc_from_pixel: Quadratic,
 }
 
 impl Outline {
-    /// About one point a pixel of rim, in order: closer ones would see the same pixels and add work, not information.
-    pub fn rim(&self) -> heapless::Vec<OutlinePoint, MAX_OUTLINE> {
+    /// Ordered rim points, about one per pixel of rim length: a higher density adds work but no information.
+    pub fn rim(&self) -> heapless::Vec<OutlinePoint, MAX_OUTLINE_POINTS> {
         let circumference = core::f64::consts::PI * (self.major + self.minor);
-        let count = (circumference as usize).clamp(MIN_OUTLINE, MAX_OUTLINE);
+        let count = (circumference as usize).clamp(MIN_OUTLINE_POINTS, MAX_OUTLINE_POINTS);
         let (ds, dc) = math::sin_cos(core::f64::consts::TAU / count as f64);
         let Quadratic { linear, square } = &self.pixel_from_disc;
         let turn = if linear.determinant() < 0.0 { -1.0 } else { 1.0 };
@@ -121,7 +121,8 @@ impl Outline {
         points
     }
 
-    /// The outline with its shape changed: a rim point at `q` from the centre moves to `q + stretch q`.
+    /// The outline with a changed shape: a rim point at `q` from the centre moves to `q + stretch q`. `None` if the
+    /// stretch is singular.
     pub fn stretched(&self, stretch: &[f64; 3]) -> Option<Self> {
         let [xx, xy, yy] = *stretch;
         let m = Matrix2::new(1.0 + xx, xy, xy, 1.0 + yy);
@@ -144,7 +145,7 @@ fn tangents(n: &Vec3) -> (Vec3, Vec3) {
     (a, n.cross(&a))
 }
 
-/// Singular values of the disc's first order: the half axes of its image.
+/// Singular values of the first-order map of the disc: the half axes of its image.
 fn extent(b: &Matrix2<f64>) -> Option<(f64, f64)> {
     let (p, q) = (b[(0, 0)] + b[(1, 1)], b[(1, 0)] - b[(0, 1)]);
     let (r, s) = (b[(0, 0)] - b[(1, 1)], b[(1, 0)] + b[(0, 1)]);
@@ -153,10 +154,10 @@ fn extent(b: &Matrix2<f64>) -> Option<(f64, f64)> {
     (major.is_finite() && minor > 0.0).then_some((major, minor))
 }
 
-/// A disc in a camera's frame: its centre, normal, and the cosine at which it faces the camera.
+/// A disc in a camera's frame: its centre, its normal, and the cosine of the angle between normal and direction to the
+/// camera.
 ///
-/// `None` when it faces away (below `min_facing`), is behind the camera or too near to it, or when a figure is not
-/// finite.
+/// `None` if it faces away (below `min_facing`), is behind the camera or too close to it, or if a value is not finite.
 fn disc(camera_from_gripper: &Pose, mark: &Mark, min_facing: f64) -> Option<(Vec3, Vec3, f64)> {
     let centre = (camera_from_gripper * Point3::from(mark.position)).coords;
     let normal = camera_from_gripper.rotation * mark.normal;
@@ -168,7 +169,7 @@ fn disc(camera_from_gripper: &Pose, mark: &Mark, min_facing: f64) -> Option<(Vec
     (facing >= min_facing).then_some((centre, normal, facing))
 }
 
-/// Where a mark is in a camera's image and how large, to first order.
+/// Position and size of a mark in a camera's image, to first order.
 ///
 /// `None` for the same reasons as [`predict`].
 pub fn footprint(camera: &Camera, camera_from_gripper: &Pose, mark: &Mark, min_facing: f64) -> Option<Footprint> {
@@ -181,8 +182,8 @@ pub fn footprint(camera: &Camera, camera_from_gripper: &Pose, mark: &Mark, min_f
 
 /// Predicts a mark's outline in a camera.
 ///
-/// `None` when the disc faces away (`facing` below `min_facing`), is behind the camera or too near to it, or when a
-/// figure is not finite. The outline may lie outside the image: the caller decides.
+/// `None` if the disc faces away (`facing` below `min_facing`), is behind the camera or too close to it, or if a value
+/// is not finite. The outline may be outside the image; the caller has to check.
 pub fn predict(camera: &Camera, camera_from_gripper: &Pose, mark: &Mark, min_facing: f64) -> Option<Outline> {
     let (centre3, normal, facing) = disc(camera_from_gripper, mark, min_facing)?;
     let centre = camera.project(&centre3)?;
@@ -200,16 +201,16 @@ pub fn predict(camera: &Camera, camera_from_gripper: &Pose, mark: &Mark, min_fac
     Some(Outline { centre, major, minor, facing, pixel_from_disc, disc_from_pixel })
 }
 
-/// The inverse to second order, then corrected by what it misses at the nodes.
+/// Second-order inverse, corrected by its error at the nodes.
 fn inverse(forward: &Quadratic, plus: &[Vector2<f64>; 4], minus: &[Vector2<f64>; 4]) -> Option<Quadratic> {
     let a = forward.linear.try_inverse()?;
     let back = Quadratic { linear: Matrix2::identity(), square: -(a * forward.square) }.after(&a);
     let node = |k: usize, sign: f64| Vector2::new(NODES[k].0, NODES[k].1) * sign;
-    let missed = Quadratic::through(
+    let error = Quadratic::through(
         &core::array::from_fn(|k| node(k, 1.0) - back.at(plus[k])),
         &core::array::from_fn(|k| node(k, -1.0) - back.at(minus[k])),
     )
     .after(&a);
-    let inverse = Quadratic { linear: back.linear + missed.linear, square: back.square + missed.square };
+    let inverse = Quadratic { linear: back.linear + error.linear, square: back.square + error.square };
     inverse.linear.iter().chain(inverse.square.iter()).all(|v| v.is_finite()).then_some(inverse)
 }

@@ -1,20 +1,20 @@
-//! Which sectors of a rim something hides, told by residuals and by flat pixels.
+//! Detects occluded sectors of a rim from residuals and flat pixels.
 
 use super::band::{Band, Flat, SECTORS};
-use super::coverage::Smear;
-use super::edge_fit::middle;
+use super::coverage::PointSpread;
+use super::edge_fit::median;
 use super::grey::Model;
 use crate::math;
 
-/// A sector whose mean square is this many times the middle one's is hidden by something: by chance, ten pixels are
-/// once in 10^6.
-const SECTOR_FACTOR: f64 = 5.0;
-/// A sector whose flat pixels are this share of the step off the others' level is hidden.
-const FAR_SHARE: f32 = 0.25;
-/// Changes of what is left out, at most: up to two thirds of the sectors.
-pub(crate) const ROUNDS: usize = 2 * SECTORS / 3;
+/// Maximum mean squared residual of a sector relative to the noise of the lower third of the sectors. By chance, ten
+/// pixels exceed it once in 10^6.
+const MAX_SECTOR_NOISE_RATIO: f64 = 5.0;
+/// Maximum difference between the flat pixels of a sector and the level of all sectors, as a fraction of the step.
+const MAX_LEVEL_ERROR: f32 = 0.25;
+/// Maximum number of changes of the excluded sectors: up to two thirds of the sectors.
+pub(crate) const MAX_ROUNDS: usize = 2 * SECTORS / 3;
 
-/// Sectors of a rim that something hides.
+/// Occluded sectors of a rim, as a bit set.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Hidden(u16);
 
@@ -33,8 +33,8 @@ impl Hidden {
     }
 }
 
-/// A model with the mean levels of the flat pixels, or those of the rim's own where a mark is too small to have any.
-pub(crate) fn begin(band: &Band, smear: Smear) -> Option<Model> {
+/// A model with the mean levels of the flat pixels, or of the rim pixels if a mark is too small to have flat pixels.
+pub(crate) fn initial_model(band: &Band, psf: PointSpread) -> Option<Model> {
     let mean = |p: &Flat| p.grey.get(..p.len).map(|g| g.iter().sum::<f32>() / g.len() as f32);
     let [outside, inside] = &band.flat;
     let mut level = [mean(outside)?, mean(inside)?];
@@ -50,14 +50,14 @@ pub(crate) fn begin(band: &Band, smear: Smear) -> Option<Model> {
         };
         level = [deep(-1.0), deep(1.0)];
     }
-    level.iter().all(|l| l.is_finite()).then_some(Model { level, ..Model::new(smear) })
+    level.iter().all(|l| l.is_finite()).then_some(Model { level, ..Model::new(psf) })
 }
 
-/// A model with the middle levels of the sectors, and the sectors that are far from them: something hides those.
+/// A model with the median levels of the sectors, and the occluded sectors, whose levels are far from the median.
 ///
-/// Only flat pixels are asked, which a shift does not change.
-pub(crate) fn begin_carefully(band: &mut Band, smear: Smear) -> Option<(Model, Hidden)> {
-    let mut m = begin(band, smear)?;
+/// Only flat pixels are used, because a shift does not change them.
+pub(crate) fn initial_model_occluded(band: &mut Band, psf: PointSpread) -> Option<(Model, Hidden)> {
+    let mut m = initial_model(band, psf)?;
     let mut means = [[None; SECTORS]; 2];
     for ((means, level), p) in means.iter_mut().zip(&mut m.level).zip(&band.flat) {
         let mut all: heapless::Vec<f64, SECTORS> = heapless::Vec::new();
@@ -70,10 +70,10 @@ pub(crate) fn begin_carefully(band: &mut Band, smear: Smear) -> Option<(Model, H
             }
         }
         if !all.is_empty() {
-            *level = middle(&mut all) as f32;
+            *level = median(&mut all) as f32;
         }
     }
-    let far = FAR_SHARE * m.step().abs();
+    let far = MAX_LEVEL_ERROR * m.step().abs();
     let mut hidden = Hidden::default();
     for (means, level) in means.iter().zip(&m.level) {
         for (k, mean) in means.iter().enumerate() {
@@ -86,8 +86,8 @@ pub(crate) fn begin_carefully(band: &mut Band, smear: Smear) -> Option<(Model, H
     Some((m, hidden))
 }
 
-/// The third of the sectors' mean squares, grey values squared: the noise, whatever hides less than two thirds of the
-/// rim.
+/// Noise variance of the flat pixels, grey values squared: the lower third of the mean squares of the sectors. It is
+/// robust against occlusion of less than two thirds of the rim.
 pub(crate) fn flat_noise(band: &Band) -> f64 {
     let mut all: heapless::Vec<f64, SECTORS> = heapless::Vec::new();
     for k in 0..SECTORS {
@@ -97,11 +97,11 @@ pub(crate) fn flat_noise(band: &Band) -> f64 {
             let _ = all.push(f64::from((a.1 + b.1) / n));
         }
     }
-    low(&mut all)
+    lower_third(&mut all)
 }
 
-/// The value that a third of the list lies below; 0 of none.
-fn low(v: &mut [f64]) -> f64 {
+/// Value at the lower third of an unsorted list; 0 if it is empty.
+fn lower_third(v: &mut [f64]) -> f64 {
     if v.is_empty() {
         return 0.0;
     }
@@ -109,8 +109,8 @@ fn low(v: &mut [f64]) -> f64 {
     *v.select_nth_unstable_by(at, f64::total_cmp).1
 }
 
-/// Sectors that do not fit, `hidden` being those that were left out: all that fit are taken in again, and the worst of
-/// those that do not is left out. `floor_px` is what the rim may be off by anyway.
+/// The new set of excluded sectors. `hidden` is the current set: its sectors that fit again are restored, and the worst
+/// of the other sectors that do not fit is added. `floor_px` is the rim error that is always accepted.
 pub(crate) fn review(band: &Band, m: &Model, noise: f64, hidden: Hidden, floor_px: f64) -> Hidden {
     let floor = math::sq(floor_px * f64::from(m.step()));
     let mut seen: heapless::Vec<f64, SECTORS> = heapless::Vec::new();
@@ -122,7 +122,7 @@ pub(crate) fn review(band: &Band, m: &Model, noise: f64, hidden: Hidden, floor_p
         }
         f64::from(squares / n.max(1.0))
     });
-    let limit = SECTOR_FACTOR * low(&mut seen).max(noise) + floor;
+    let limit = MAX_SECTOR_NOISE_RATIO * lower_third(&mut seen).max(noise) + floor;
     let mut next = Hidden::default();
     let mut worst: Option<usize> = None;
     for (k, v) in mean.iter().enumerate().filter(|(_, v)| !(**v <= limit)) {
