@@ -75,9 +75,9 @@ impl FreezeWatch {
     }
 }
 
-/// Whether an image is black, saturated, or without contrast, from a few hundred of its pixels.
+/// Whether an image is black, saturated, or without contrast, from about a thousand of its pixels.
 pub(crate) fn badly_exposed(image: &ImageView<'_>, min_contrast: f64) -> bool {
-    const SIDE: usize = 16;
+    const SIDE: usize = 32;
     let (mut black, mut white, mut low, mut high) = (0_u32, 0_u32, 255_u8, 0_u8);
     for j in 0..SIDE {
         let row = image.row((2 * j + 1) * image.height() / (2 * SIDE));
