@@ -37,6 +37,13 @@ pub enum HostedError {
     Refused(String),
 }
 
+/// The `n`th address of 127.64.0.0/10, without those that end in 0 or 255. Consecutive numbers have different addresses.
+fn address(n: u32) -> IpAddr {
+    const HOSTS: u32 = 254;
+    let (host, net) = (n % HOSTS + 1, n / HOSTS);
+    IpAddr::V4(Ipv4Addr::new(127, 64 + (net >> 8 & 63) as u8, net as u8, host as u8))
+}
+
 /// Mocks started by this process; part of their addresses.
 static COUNT: AtomicU32 = AtomicU32::new(0);
 
@@ -47,11 +54,9 @@ impl Hosted {
     /// # Errors
     /// When the ports are taken or the record cannot be written.
     pub fn start(setup: Setup, limits: Option<(f64, f64)>, record: Option<PathBuf>) -> Result<Self, HostedError> {
-        // 127.64.0.0/10 by process id and count, so that tests of several processes can run in parallel.
+        // By process id and count, so that tests of several processes can run in parallel.
         let n = COUNT.fetch_add(1, Ordering::Relaxed);
-        let mixed = std::process::id().wrapping_mul(61).wrapping_add(n);
-        let address =
-            IpAddr::V4(Ipv4Addr::new(127, 64 + (mixed >> 16 & 63) as u8, (mixed >> 8) as u8, (mixed as u8).max(1)));
+        let address = address(std::process::id().wrapping_mul(61).wrapping_add(n));
         let recorder = record.map(|path| Recorder::create(&path)).transpose()?;
         let world = World::new(Robot::new(setup), limits, recorder);
         let mut server = Server::bind(world, address, 0, Some(0))?;
@@ -117,5 +122,20 @@ impl Hosted {
 impl Drop for Hosted {
     fn drop(&mut self) {
         self.join();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::HashSet;
+
+    #[test]
+    fn consecutive_mocks_have_different_addresses() {
+        for start in [0, 4_000, 61 * 4_194_304] {
+            let seen: HashSet<IpAddr> = (start..start + 100_000).map(address).collect();
+            assert_eq!(seen.len(), 100_000);
+            assert!(seen.iter().all(|a| a.is_loopback()));
+        }
     }
 }
