@@ -6,10 +6,11 @@
 //! - [`offline`]: the off-line stage, in the order of the paper. Two images of a rim become edges, contours, image
 //!   ellipses, cones, a rim in space, a grasp and a set-point (`offline::plan`). A part with a CAD model takes
 //!   `offline::polyhedral` (section 3.1) to the same set-point.
-//! - `calibrate`: where a calibration of a rig or a gripper is made; it writes the files that [`files`] reads.
-//! - [`commands`]: the sub-commands `plan`, `plan --mesh`, `reconstruct` and `study` without their command line.
+//! - [`calibrate`]: the calibration of a rig from images of a target, and of a gripper from an arm at rest.
+//! - [`commands`]: the sub-commands `plan`, `plan --mesh`, `reconstruct`, `study`, `calibrate` and `rig` without their
+//!   command line.
 //!
-//! Dependencies point one way: `commands` uses `offline`, `offline` uses `files`, and `files` uses only value types of
+//! Dependencies point one way: `commands` uses `offline` and `calibrate`, these use `files`, and `files` uses only value types of
 //! `graspd_rt`.
 //!
 //! # Conventions

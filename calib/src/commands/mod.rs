@@ -4,9 +4,10 @@
 //! The command-line parser and the exit codes are the daemon's. A command reads its files itself, so that every failure
 //! is one sentence that names the file, the key or the option.
 
+pub mod calibrate;
 pub mod mesh;
 pub mod plan;
-pub(crate) mod progress;
+mod progress;
 pub mod reconstruct;
 pub mod study;
 
@@ -65,6 +66,11 @@ impl From<FileError> for Failure {
 /// An option is missing or invalid.
 fn usage(reason: impl Into<String>) -> Failure {
     Failure { class: Class::Usage, kind: "usage", reason: reason.into() }
+}
+
+/// A file or a value in it is wrong.
+fn input(reason: impl std::fmt::Display) -> Failure {
+    Failure { class: Class::Input, kind: "input", reason: reason.to_string() }
 }
 
 /// Checks the value of a numeric option against its range; an option that was not given passes.

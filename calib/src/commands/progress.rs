@@ -10,7 +10,7 @@ const UPDATE_PERIOD: Duration = Duration::from_millis(100);
 
 /// Progress of one piece of work. On a terminal one line is rewritten and erased at the end; elsewhere a single line is
 /// printed once the work takes long.
-pub(crate) struct Progress<W: Write = std::io::Stderr> {
+pub(super) struct Progress<W: Write = std::io::Stderr> {
     what: &'static str,
     out: W,
     terminal: bool,
@@ -21,7 +21,7 @@ pub(crate) struct Progress<W: Write = std::io::Stderr> {
 
 impl Progress {
     /// Starts now.
-    pub(crate) fn new(what: &'static str) -> Self {
+    pub(super) fn new(what: &'static str) -> Self {
         let out = std::io::stderr();
         Self { what, terminal: out.is_terminal(), out, begun: Instant::now(), shown: None }
     }
@@ -29,7 +29,7 @@ impl Progress {
 
 impl<W: Write> Progress<W> {
     /// Reports that a fraction of the work, 0 to 1, is done.
-    pub(crate) fn at(&mut self, fraction: f64) {
+    pub(super) fn at(&mut self, fraction: f64) {
         self.at_time(fraction, Instant::now());
     }
 

@@ -1,11 +1,11 @@
 //! `graspd plan`: the off-line stage, for a contour in two images or for a CAD mesh.
 
+use super::answer::finish;
 use super::args::PlanArgs;
 use crate::exit::{Exit, Failure};
+use graspd_calib::commands::parse_pose;
 use graspd_calib::commands::plan::{PlanRequest, run};
-use graspd_calib::commands::{Class, Outcome, parse_pose};
 use graspd_calib::files::keep_apart;
-use std::io::Write as _;
 use std::path::Path;
 
 /// Makes a plan.
@@ -15,7 +15,7 @@ use std::path::Path;
 pub fn plan(args: &PlanArgs) -> Result<Exit, Failure> {
     check_outputs(args).map_err(|message| Failure { exit: Exit::Usage, message })?;
     if args.part.mesh.is_some() {
-        return finish(args, super::mesh::plan(args));
+        return finish(args.json, super::mesh::plan(args));
     }
     let present = args
         .present
@@ -51,7 +51,7 @@ pub fn plan(args: &PlanArgs) -> Result<Exit, Failure> {
         overlay: args.overlay.clone(),
         report: args.report.clone(),
     });
-    finish(args, outcome)
+    finish(args.json, outcome)
 }
 
 /// Refuses to overwrite an input with an output.
@@ -73,28 +73,4 @@ fn check_outputs(args: &PlanArgs) -> Result<(), String> {
             ("--base", base),
         ],
     )
-}
-
-/// Prints the outcome; its class selects the exit code.
-fn finish(args: &PlanArgs, outcome: Outcome) -> Result<Exit, Failure> {
-    if args.json {
-        print_line(&outcome.json);
-    }
-    let exit = match outcome.class {
-        Class::Done => {
-            if !args.json {
-                print_line(&outcome.text);
-            }
-            return Ok(Exit::Done);
-        }
-        Class::Refused => Exit::NotConverged,
-        Class::Usage => Exit::Usage,
-        Class::Input => Exit::Input,
-    };
-    Err(Failure { exit, message: outcome.text })
-}
-
-/// Prints a line. A closed pipe (`| head`) is not an error: the plan is written by then.
-fn print_line(line: &dyn std::fmt::Display) {
-    let _ = writeln!(std::io::stdout(), "{line}");
 }

@@ -3,7 +3,7 @@
 use super::answer::finish;
 use crate::exit::{Exit, Failure};
 use clap::{Args, Subcommand};
-use graspd_calib::calibrate::command;
+use graspd_calib::commands::calibrate as command;
 use std::path::PathBuf;
 
 /// Commands on a rig file.

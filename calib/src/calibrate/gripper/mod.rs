@@ -59,7 +59,6 @@ mod align;
 mod arm_check;
 mod bundle;
 mod closed_form;
-pub mod command;
 mod data;
 mod degrees;
 mod error;

@@ -1,10 +1,8 @@
 //! `graspd calibrate gripper` without the command-line parser: takes paths and options, writes files, and returns text,
 //! JSON and an exit code. Every failure has a message.
 
-use super::error::GripperError;
-use super::report::{Verdict, refusal_json};
-use super::{calibrate, read};
-use crate::calibrate::command::{Answer, Outcome};
+use super::{Class, Outcome};
+use crate::calibrate::gripper::{GripperError, Solution, Verdict, calibrate, gripper_of, load, refusal_json};
 use crate::files::{GripperFile, RigFile};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -28,28 +26,28 @@ pub struct GripperRequest {
 
 /// Runs the calibration.
 pub fn calibrate_gripper(r: &GripperRequest) -> Outcome {
-    run(r).unwrap_or_else(|(answer, text, json)| Outcome { answer, text, json })
+    run(r).unwrap_or_else(|(class, text, json)| Outcome { class, text, json })
 }
 
-type Failure = (Answer, String, Value);
+type Failure = (Class, String, Value);
 
 fn input(e: impl std::fmt::Display) -> Failure {
     let text = e.to_string();
     let json = json!({ "verdict": "refused", "reason": text, "findings": [] });
-    (Answer::Input, text, json)
+    (Class::Input, text, json)
 }
 
 fn run(r: &GripperRequest) -> Result<Outcome, Failure> {
     if !(r.tolerance_mm > 0.0 && r.tolerance_mm <= 1000.0) {
         let text = format!("--tolerance-mm {}: give more than 0 and at most 1000", r.tolerance_mm);
-        return Err((Answer::Usage, text.clone(), json!({ "verdict": "refused", "reason": text, "findings": [] })));
+        return Err((Class::Usage, text.clone(), json!({ "verdict": "refused", "reason": text, "findings": [] })));
     }
     let tolerance = r.tolerance_mm * 1e-3;
     let rig = r.rig.as_deref().map(RigFile::load).transpose().map_err(input)?;
-    let mut rec = read::load(&r.data, rig.as_ref()).map_err(input)?;
+    let mut rec = load(&r.data, rig.as_ref()).map_err(input)?;
     let template = r.gripper.as_deref().map(GripperFile::load).transpose().map_err(input)?;
     let template = match (template, &r.out) {
-        (None, Some(_)) => Some(read::gripper_of(&r.data).map_err(input)?),
+        (None, Some(_)) => Some(gripper_of(&r.data).map_err(input)?),
         (t, _) => t,
     };
     if let Some(t) = &template {
@@ -65,11 +63,11 @@ fn run(r: &GripperRequest) -> Result<Outcome, Failure> {
         rec.assumed = rec.assumed.or(Some(t.gripper.flange_from_gripper));
     }
     let s = calibrate(&rec, tolerance).map_err(|e| {
-        let answer = match e {
-            GripperError::TooLittle { .. } | GripperError::NotConverged(_) => Answer::Refused,
-            _ => Answer::Input,
+        let class = match e {
+            GripperError::TooLittle { .. } | GripperError::NotConverged(_) => Class::Refused,
+            _ => Class::Input,
         };
-        (answer, e.to_string(), refusal_json(&e))
+        (class, e.to_string(), refusal_json(&e))
     })?;
     let mut text = s.to_text(&rec, tolerance);
     let json = s.to_json(&rec, tolerance);
@@ -78,7 +76,7 @@ fn run(r: &GripperRequest) -> Result<Outcome, Failure> {
         if r.out.is_some() {
             text.push_str("\nNo file was written.");
         }
-        return Ok(Outcome { answer: Answer::Refused, text, json });
+        return Ok(Outcome { class: Class::Refused, text, json });
     }
     if let (Some(path), Some(mut file)) = (&r.out, template) {
         file.gripper.flange_from_gripper = s.flange_from_gripper;
@@ -89,10 +87,10 @@ fn run(r: &GripperRequest) -> Result<Outcome, Failure> {
     if let Some(path) = &r.rig_out {
         text.push_str(&write_rig(path, rig, &s)?);
     }
-    Ok(Outcome { answer: Answer::Done, text, json })
+    Ok(Outcome { class: Class::Done, text, json })
 }
 
-fn write_rig(path: &Path, given: Option<RigFile>, s: &super::Solution) -> Result<String, Failure> {
+fn write_rig(path: &Path, given: Option<RigFile>, s: &Solution) -> Result<String, Failure> {
     if s.hypothesis.rig_scale == 0.0 {
         return Ok(format!("\n{} was not written: the rig is unchanged.", path.display()));
     }

@@ -1,12 +1,12 @@
 //! `graspd calibrate rig`.
 
-use super::{Answer, Failure, Outcome, RigRequest, input, usage};
+use super::progress::Progress;
+use super::{Class, Failure, Outcome, RigRequest, input, usage};
 use crate::calibrate::rig::holdout::FOLDS;
 use crate::calibrate::rig::score::{mean, quantile, rms};
 use crate::calibrate::rig::solve::Lens;
 use crate::calibrate::rig::{Calibration, Options, Pair, calibrate};
 use crate::calibrate::target::{Collected, FoundPair, Target, collect};
-use crate::commands::progress::Progress;
 use serde_json::{Value, json};
 use std::fmt::Write as _;
 use std::path::Path;
@@ -34,8 +34,11 @@ fn work(request: &RigRequest) -> Result<Outcome, Failure> {
     let lens = Lens { sizes: collected.sizes, rational: request.rational };
     let options = Options { lens, range_m, tolerance_m: request.tolerance_mm * 1e-3 };
     let found = pairs.len();
-    let calibration = calibrate(&target, pairs, &options)
-        .map_err(|e| Failure(Answer::Refused, "calibration", format!("{e}{}", missing_text(&collected, found))))?;
+    let calibration = calibrate(&target, pairs, &options).map_err(|e| Failure {
+        class: Class::Refused,
+        kind: "calibration",
+        reason: format!("{e}{}", missing_text(&collected, found)),
+    })?;
     let file = calibration.file(request.rational, None);
     if let Some(out) = &request.out {
         file.save(out).map_err(input)?;
@@ -45,7 +48,7 @@ fn work(request: &RigRequest) -> Result<Outcome, Failure> {
     }
     let notes = notes(&collected, dropped);
     Ok(Outcome {
-        answer: Answer::Done,
+        class: Class::Done,
         text: text(&collected, &calibration, &notes, request.out.as_deref()),
         json: figures(&collected, &calibration, &notes),
     })

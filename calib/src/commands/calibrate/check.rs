@@ -1,7 +1,7 @@
 //! `graspd calibrate check`.
 
 use super::rig::{collected, pair};
-use super::{Answer, CheckRequest, Failure, Outcome, input, usage};
+use super::{CheckRequest, Class, Failure, Outcome, input, usage};
 use crate::calibrate::rig::check::{Check, CheckState, check};
 use crate::calibrate::rig::score::{mean, quantile, rms};
 use crate::calibrate::target::{Collected, Target};
@@ -33,30 +33,33 @@ fn work(request: &CheckRequest) -> Result<Outcome, Failure> {
         let first = c.missing.first().map_or("", |m| m.1.as_str());
         return Err(input(format!("the target was not detected in both images of any pair; first pair: {first}")));
     }
-    let found = check(&target, c.pairs.iter().map(pair).collect(), &file)
-        .map_err(|e| Failure(Answer::Refused, "check", e.to_string()))?;
+    let found = check(&target, c.pairs.iter().map(pair).collect(), &file).map_err(|e| Failure {
+        class: Class::Refused,
+        kind: "check",
+        reason: e.to_string(),
+    })?;
     Ok(outcome(&c, &found))
 }
 
 fn outcome(c: &Collected, k: &Check) -> Outcome {
     let turn = k.motion.fixed_rows::<3>(3).norm().to_degrees();
     let shift = k.motion.fixed_rows::<3>(0).norm() * 1e3;
-    let (verdict, meaning, answer) = match k.state {
-        CheckState::Holds => ("holds", "the stored calibration is still valid", Answer::Done),
+    let (verdict, meaning, class) = match k.state {
+        CheckState::Holds => ("holds", "the stored calibration is still valid", Class::Done),
         CheckState::Drifted => (
             "drifted",
             "the relative pose of the cameras has changed by an amount that is still acceptable",
-            Answer::Done,
+            Class::Done,
         ),
         CheckState::Coarse => (
             "coarse",
             "the error of the stored calibration is too large, although within the uncertainty that its file states: calibrate again",
-            Answer::Refused,
+            Class::Refused,
         ),
         CheckState::Changed => (
             "changed",
             "the stored calibration is no longer valid: check the camera mounting, and calibrate again",
-            Answer::Refused,
+            Class::Refused,
         ),
     };
     let mut text = format!(
@@ -87,5 +90,5 @@ fn outcome(c: &Collected, k: &Check) -> Outcome {
         "turn_deg": turn, "moved_mm": shift, "chi2": k.chi2, "dof": 6, "missing": c.missing,
         "left_out": k.left_out.iter().map(|l| json!({ "name": l.name, "kind": l.kind, "reason": l.reason })).collect::<Vec<_>>(),
     });
-    Outcome { answer, text, json }
+    Outcome { class, text, json }
 }

@@ -1,6 +1,6 @@
 //! `graspd rig show`.
 
-use super::{Answer, Failure, Outcome, input};
+use super::{Class, Failure, Outcome, input};
 use crate::files::RigFile;
 use graspd_rt::geom::{Camera, Pixel, View};
 use serde_json::json;
@@ -60,5 +60,5 @@ fn work(path: &Path) -> Result<Outcome, Failure> {
             "focal_difference": error.focal_difference, "principal_px": error.principal_px },
         "covariance": file.covariance.is_some(),
     });
-    Ok(Outcome { answer: Answer::Done, text, json })
+    Ok(Outcome { class: Class::Done, text, json })
 }
